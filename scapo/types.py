@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""The data that flows through the project: plain frozen records, no logic.
+
+Shapes use `*B` for any batch shape, `N` points, `P` parts, `J` joints. Frames are named at each
+field; `a_T_b` maps coordinates in frame b to frame a. Metres and radians throughout.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+JointKind = Literal["revolute", "prismatic"]
+RestRule = Literal["smallest-box", "largest-box", "tallest"]
+Supervision = Literal["pose", "segmentation", "joint"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointSpec:
+    """One joint of a category: its kind, the parts it links and its travel from rest."""
+
+    kind: JointKind
+    parent: int
+    """Part index of the parent, 0 for all benchmark categories."""
+    child: int
+    lower: float
+    """Smallest state, rad or m; 0 is rest."""
+    upper: float
+    """Largest state of the category, rad or m. An instance may stop earlier."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """Where a person would look from: camera angles about the object, degrees.
+
+    `azimuth` turns about the object's z axis, 0 looks at the front (camera on the -x side),
+    positive counter-clockwise seen from above; `elevation` is above the horizon.
+    """
+
+    azimuth: tuple[float, float]
+    elevation: tuple[float, float]
+
+
+Matrix3 = tuple[
+    tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Category:
+    """What is fixed for every instance of a category. `categories.CATEGORIES` lists them."""
+
+    name: str
+    parts: tuple[str, ...]
+    joints: tuple[JointSpec, ...]
+    benchmark: tuple[Literal["clean", "sensor"], ...]
+    symmetry: Matrix3 | None
+    """Rotation A of the object frame that exchanges the parts (CONTRACT 1), or None."""
+    window: Window
+    diagonal: float
+    """Nominal diagonal of the box at rest in metres, for models without metric size."""
+    rest: RestRule
+    """Which joint limit is rest, for models that do not say: the one with this bounding box."""
+    words: tuple[str, ...]
+    """Link or semantic names that tell the moving parts of this category."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Joints:
+    """Joint parameters, in the frame that the owner names."""
+
+    pivot: Float[Tensor, "*B J 3"]
+    """Metres, a point on the axis."""
+    axis: Float[Tensor, "*B J 3"]
+    """Unit vector, right-hand rule."""
+    state: Float[Tensor, "*B J"]
+    """rad or m, child minus parent, 0 at rest and >= 0 towards open."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Observation:
+    """All that a method may see at test time."""
+
+    points: Float[Tensor, "*B N 3"]
+    """Camera frame, metres."""
+    color: Float[Tensor, "*B N 3"] | None = None
+    """In [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Labels:
+    """Ground truth; None = withheld."""
+
+    part: Int[Tensor, "*B N"] | None = None
+    """Part index, -1 = background or unlabelled (255 on disk)."""
+    camera_T_part: Float[Tensor, "*B P 4 4"] | None = None
+    joints: Joints | None = None
+    """Camera frame."""
+
+    def keep(self, supervision: frozenset[Supervision]) -> Labels:
+        """The labels that a method with this supervision may see; all else is None."""
+        return Labels(
+            part=self.part if "segmentation" in supervision else None,
+            camera_T_part=self.camera_T_part if "pose" in supervision else None,
+            joints=self.joints if "joint" in supervision else None,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SampleKey:
+    """Which sample this is: unique within a data set."""
+
+    category: str
+    split: str
+    index: int
+    instance: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sample:
+    """One view of one object in one state."""
+
+    key: SampleKey
+    observation: Observation
+    labels: Labels
+    visible: Float[Tensor, "P"]  # noqa: F821
+    """Share of each part's surface seen in this view."""
+    camera: Float[Tensor, "6"]
+    """fx, fy, cx, cy, width, height in pixels."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """What a method says of a cloud. Part frames are the method's own unless it was supervised."""
+
+    part_weight: Float[Tensor, "*B N P"]
+    """Rows on the simplex; a hard segmentation is one-hot."""
+    camera_T_part: Float[Tensor, "*B P 4 4"] | None = None
+    joints: Joints | None = None
+    """Camera frame."""
+    canonical_points: Float[Tensor, "*B M 3"] | None = None
+    """The object in the method's canonical frame and state, metres."""
+    confidence: Float[Tensor, "*B"] | None = None
