@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import roma
 import torch
 from jaxtyping import Float, Shaped
@@ -62,9 +64,7 @@ def joint_motion(
     return rigid(rotation, pivot - (rotation @ pivot[..., None])[..., 0])
 
 
-def rotation_angle(
-    a: Float[Tensor, "*B 3 3"], b: Float[Tensor, "*B 3 3"]
-) -> Float[Tensor, "*B"]:
+def rotation_angle(a: Float[Tensor, "*B 3 3"], b: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B"]:
     """Geodesic angle between two rotations in radians, exact near 0 and pi (roma, by atan2)."""
     return roma.rotmat_geodesic_distance(a, b)
 
@@ -114,7 +114,7 @@ def skew_matrix(v: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
 
 def project_rotation(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
     """The rotation nearest to a matrix in the Frobenius norm (SVD, det = +1)."""
-    return roma.special_procrustes(matrix)
+    return cast("Tensor", roma.special_procrustes(matrix))
 
 
 def mean_rotation(
@@ -130,15 +130,11 @@ def random_rotations(
     count: int, generator: torch.Generator, *, dtype: torch.dtype = torch.float32
 ) -> Float[Tensor, "{count} 3 3"]:
     """Uniform on SO(3), from normalised Gaussian quaternions, on the generator's device."""
-    quaternion = torch.randn(
-        count, 4, generator=generator, device=generator.device, dtype=dtype
-    )
+    quaternion = torch.randn(count, 4, generator=generator, device=generator.device, dtype=dtype)
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
 
 
-def is_rotation(
-    matrix: Shaped[Tensor, "*B 3 3"], tolerance: float = 1e-3
-) -> Shaped[Tensor, "*B"]:
+def is_rotation(matrix: Shaped[Tensor, "*B 3 3"], tolerance: float = 1e-3) -> Shaped[Tensor, "*B"]:
     """Whether R R^T = I within `tolerance` per entry and det > 0; False for NaN."""
     eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
     orthogonal = ((matrix @ matrix.mT - eye).abs() < tolerance).all(-1).all(-1)

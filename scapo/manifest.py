@@ -124,18 +124,24 @@ def _check(path: Path, manifest: Manifest) -> None:
     first = 0
     for shard in manifest.shards:
         if shard.first != first or shard.count < 1:
-            raise ManifestError(f"{path}: shard {shard.file}: expected first {first} and a count "
-                                f"of 1 or more, found {shard.first} and {shard.count}")
+            raise ManifestError(
+                f"{path}: shard {shard.file}: expected first {first} and a count "
+                f"of 1 or more, found {shard.first} and {shard.count}"
+            )
         if Path(shard.file).name != shard.file:
-            raise ManifestError(f"{path}: expected a shard name without folders, found "
-                                f"{shard.file!r}")
+            raise ManifestError(
+                f"{path}: expected a shard name without folders, found {shard.file!r}"
+            )
         first += shard.count
     if first != manifest.count:
         raise ManifestError(f"{path}: expected count {manifest.count}, found {first} in shards")
     if len(manifest.parts) != len(manifest.joints) + 1:
-        raise ManifestError(f"{path}: expected one joint less than parts, found "
-                            f"{len(manifest.parts)} parts and {len(manifest.joints)} joints")
+        raise ManifestError(
+            f"{path}: expected one joint less than parts, found "
+            f"{len(manifest.parts)} parts and {len(manifest.joints)} joints"
+        )
     found = shards_digest(manifest.shards)
     if found != manifest.digest:
-        raise ManifestError(f"{path}: expected digest {found} of the shards, found "
-                            f"{manifest.digest}")
+        raise ManifestError(
+            f"{path}: expected digest {found} of the shards, found {manifest.digest}"
+        )

@@ -40,9 +40,7 @@ def k_nearest(
     return score.topk(k, dim=-1, largest=False).indices
 
 
-def gather(
-    points: Float[Tensor, "*B M C"], index: Int[Tensor, "*B K"]
-) -> Float[Tensor, "*B K C"]:
+def gather(points: Float[Tensor, "*B M C"], index: Int[Tensor, "*B K"]) -> Float[Tensor, "*B K C"]:
     """points[..., index, :] per batch element."""
     return points.gather(-2, index[..., None].expand(*index.shape, points.shape[-1]))
 

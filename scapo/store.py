@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -22,9 +22,22 @@ from safetensors.numpy import save
 
 from scapo.manifest import Manifest, ManifestError, read_manifest
 
+if TYPE_CHECKING:
+    from scapo.data import SampleDataset
+
 SAMPLES = "scapo-samples/1"
 PREDICTIONS = "scapo-predictions/1"
 CHECKPOINT = "scapo-checkpoint/1"
+
+
+class Shaped(Protocol):
+    """Anything with a shape: numpy or torch."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of the dimensions."""
+        ...
+
 
 Arrays = dict[str, np.ndarray]
 Header = dict[str, Any]
@@ -45,11 +58,12 @@ def sha256_bytes(data: bytes) -> str:
 
 
 def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes in hex."""
+    """SHA-256 of a file's bytes in hex, read in pieces."""
+    digest = hashlib.sha256()
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(
-            hashlib, "file_digest"
-        ) else sha256_bytes(file.read())
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()
 
 
 def write_bytes(path: Path, data: bytes) -> None:
@@ -79,8 +93,16 @@ def write(path: Path, arrays: Mapping[str, np.ndarray], header: Header) -> str:
     return sha256_bytes(data)
 
 
-def read_header(path: Path, format: str | None = None) -> Header:
+def _open(path: Path) -> Any:  # noqa: ANN401 - safetensors ships no types
+    return safe_open(path, "numpy")
+
+
+def read_header(path: Path, expected: str | None = None) -> Header:
     """The header alone.
+
+    Args:
+        path: A safetensors file.
+        expected: The header's `format`, None for any.
 
     Raises:
         StoreError: No such file, not safetensors, no `scapo` entry, or another format.
@@ -88,36 +110,43 @@ def read_header(path: Path, format: str | None = None) -> Header:
     if not path.is_file():
         raise StoreError(f"{path}: expected a file, found none")
     try:
-        with safe_open(path, "numpy") as file:
-            metadata = file.metadata() or {}
-        header = json.loads(metadata["scapo"])
+        with _open(path) as file:
+            metadata: dict[str, str] = file.metadata() or {}
     except (SafetensorError, OSError) as error:
         raise StoreError(f"{path}: expected a safetensors file, found {error}") from error
-    except (KeyError, json.JSONDecodeError) as error:
-        found = f"entries {sorted(metadata)}" if "scapo" not in metadata else "broken JSON"
-        raise StoreError(f"{path}: expected JSON in the metadata entry 'scapo', found {found}"
-                         ) from error
-    found = header.get("format") if isinstance(header, dict) else type(header).__name__
-    if not isinstance(header, dict) or (format is not None and found != format):
-        raise StoreError(f"{path}: expected format {format!r}, found {found!r}")
+    if "scapo" not in metadata:
+        raise StoreError(
+            f"{path}: expected the metadata entry 'scapo', found {sorted(metadata) or 'none'}"
+        )
+    try:
+        header: Header = json.loads(metadata["scapo"])
+    except json.JSONDecodeError as error:
+        raise StoreError(f"{path}: expected JSON in the header, found {error}") from error
+    if not isinstance(header, dict):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise StoreError(f"{path}: expected a JSON object, found {type(header).__name__}")
+    if expected is not None and header.get("format") != expected:
+        raise StoreError(f"{path}: expected format {expected!r}, found {header.get('format')!r}")
     return header
 
 
 def read(
-    path: Path, format: str | None = None, names: tuple[str, ...] | None = None
+    path: Path, expected: str | None = None, names: tuple[str, ...] | None = None
 ) -> tuple[Arrays, Header]:
     """Arrays (all, or those of `names` that are there) and header.
 
     Raises:
         StoreError: As `read_header`, or a tensor cannot be read as numpy.
     """
-    header = read_header(path, format)
+    header = read_header(path, expected)
+    arrays: Arrays = {}
     try:
-        with safe_open(path, "numpy") as file:
-            wanted = [name for name in file.keys() if names is None or name in names]  # noqa: SIM118
-            return {name: file.get_tensor(name) for name in wanted}, header
-    except (SafetensorError, TypeError) as error:
+        with _open(path) as file:
+            for name in file.keys():  # noqa: SIM118 - the file is no mapping
+                if names is None or name in names:
+                    arrays[name] = file.get_tensor(name)
+    except (SafetensorError, TypeError, OSError) as error:
         raise StoreError(f"{path}: expected numpy-readable tensors, found {error}") from error
+    return arrays, header
 
 
 class Split:
@@ -188,7 +217,7 @@ class Split:
 
 
 def check_shape(
-    path: Path, name: str, array: np.ndarray, expected: tuple[int | None, ...] | None
+    path: Path, name: str, array: Shaped, expected: tuple[int | None, ...] | None
 ) -> None:
     """Refuse an array of another shape; None matches any length.
 
@@ -197,12 +226,14 @@ def check_shape(
     """
     if expected is None:
         return
-    fits = len(expected) == array.ndim and all(
+    fits = len(expected) == len(array.shape) and all(
         want in (None, have) for want, have in zip(expected, array.shape, strict=True)
     )
     if not fits:
         shape = tuple("*" if want is None else want for want in expected)
-        raise StoreError(f"{path}: tensor {name!r}: expected shape {shape}, found {array.shape}")
+        raise StoreError(
+            f"{path}: tensor {name!r}: expected shape {shape}, found {tuple(array.shape)}"
+        )
 
 
 def find_split(folder: Path, category: str | None, split: str) -> Path:
@@ -219,8 +250,10 @@ def find_split(folder: Path, category: str | None, split: str) -> Path:
         found = [folder] if pattern == "." else sorted(folder.glob(pattern))
         found = [path for path in found if _is_split(path, category, split)]
         if len(found) > 1:
-            raise StoreError(f"{folder}: expected one {name}/{split}, found "
-                             + ", ".join(str(path.relative_to(folder)) for path in found))
+            raise StoreError(
+                f"{folder}: expected one {name}/{split}, found "
+                + ", ".join(str(path.relative_to(folder)) for path in found)
+            )
         if found:
             return found[0]
     raise StoreError(f"{folder}: expected {name}/{split}/manifest.json, found none")
@@ -240,3 +273,10 @@ def _is_split(folder: Path, category: str | None, split: str) -> bool:
 def open_split(folder: Path | str, category: str | None = None, split: str = "train") -> Split:
     """Find and open a split; see `find_split`."""
     return Split(find_split(Path(folder), category, split))
+
+
+def dataset(folder: Path | str, category: str | None = None, split: str = "train") -> SampleDataset:
+    """A `torch.utils.data.Dataset` over a folder; see `scapo.data.SampleDataset`."""
+    from scapo.data import dataset as build  # data reads through this module
+
+    return build(folder, category, split)

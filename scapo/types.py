@@ -44,9 +44,7 @@ class Window:
     elevation: tuple[float, float]
 
 
-Matrix3 = tuple[
-    tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]
-]
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,9 +124,9 @@ class Sample:
     key: SampleKey
     observation: Observation
     labels: Labels
-    visible: Float[Tensor, "P"]  # noqa: F821
+    visible: Float[Tensor, P]  # noqa: F821
     """Share of each part's surface seen in this view."""
-    camera: Float[Tensor, "6"]
+    camera: Float[Tensor, 6]
     """fx, fy, cx, cy, width, height in pixels."""
 
 

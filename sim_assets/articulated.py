@@ -59,11 +59,11 @@ class ArticulatedObject:
     """A point on each axis, m. Prismatic: the centre of the moving part's box."""
     axis: Float[np.ndarray, "J 3"]
     """Unit; revolute by the right-hand rule, so that a state > 0 opens."""
-    upper: Float[np.ndarray, "J"]  # noqa: F821
+    upper: Float[np.ndarray, " J"]
     """Travel: the state runs from 0 to here, rad or m."""
     origin: Origin
 
-    def pose(self, state: Float[np.ndarray, "J"]) -> Float[np.ndarray, "P 4 4"]:  # noqa: F821
+    def pose(self, state: Float[np.ndarray, " J"]) -> Float[np.ndarray, "P 4 4"]:
         """object_T_part of every part: its parent's pose followed by the joint's motion."""
         poses = np.tile(np.eye(4), (len(self.visuals), 1, 1))
         for j, joint in enumerate(self.category.joints):
@@ -81,14 +81,14 @@ class ArticulatedObject:
         )
         return trimesh.Trimesh(vertices, faces, process=False)
 
-    def extents(self) -> Float[np.ndarray, "3"]:
+    def extents(self) -> Float[np.ndarray, 3]:
         """Sides of the bounding box at rest, m."""
         points = np.concatenate([v.mesh.bounds for part in self.visuals for v in part])
         return points.max(0) - points.min(0)
 
 
 def joint_motion(
-    pivot: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], state: float, kind: str
+    pivot: Float[np.ndarray, 3], axis: Float[np.ndarray, 3], state: float, kind: str
 ) -> Float[np.ndarray, "4 4"]:
     """`scapo.geometry.joint_motion` for one joint in float64 numpy."""
     motion = np.eye(4)

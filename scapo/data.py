@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: MIT
+"""A split on disk as a `torch.utils.data.Dataset` and as batched `Observation` and `Labels`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from scapo.store import Split, StoreError, check_shape, open_split, read_header
+from scapo.types import Joints, Labels, Observation
+
+UNLABELLED = 255
+"""Part index of background and unlabelled points on disk; -1 in memory."""
+
+TENSORS = (
+    "points",
+    "part",
+    "camera_T_part",
+    "joint_pivot",
+    "joint_axis",
+    "joint_state",
+    "visible",
+    "camera",
+    "instance",
+)
+
+
+class SampleDataset(Dataset[dict[str, Tensor]]):
+    """Samples of one split; an item is a dict of tensors that `default_collate` stacks.
+
+    Names and shapes are those on disk (CONTRACT 3) without the leading sample dimension; `part`
+    is int64 with -1 for background, `index` the position in the split. Shards are memory-mapped
+    and opened in the process that reads them, so the object pickles into DataLoader workers; a
+    whole batch is fetched at once (`__getitems__`), one read per shard it touches.
+    """
+
+    def __init__(self, split: Split, names: Sequence[str] = TENSORS) -> None:
+        """See `scapo.store.dataset`."""
+        self.split = split
+        self.names = tuple(names)
+        counts = [shard.count for shard in split.manifest.shards]
+        self._ends = np.cumsum(counts)
+        self._open: dict[int, dict[str, Tensor]] = {}
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        return self.split.manifest.count
+
+    def __getstate__(self) -> dict[str, object]:
+        """Without the open memory maps: a worker opens its own."""
+        return {**self.__dict__, "_open": {}}
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        """Sample `index`; negative counts from the end."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index}: expected less than {len(self)}")
+        return self.__getitems__([index % len(self)])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Tensor]]:
+        """Several samples: the call that DataLoader makes for a batch."""
+        batch = self.batch(torch.as_tensor(indices))
+        return [{name: tensor[i] for name, tensor in batch.items()} for i in range(len(indices))]
+
+    def batch(self, indices: Tensor) -> dict[str, Tensor]:
+        """The samples of `indices` (K,) stacked, in that order."""
+        shard_of = np.searchsorted(self._ends, indices.numpy(), side="right")
+        order = np.argsort(shard_of, kind="stable")
+        pieces: dict[str, list[Tensor]] = {name: [] for name in self.names}
+        for shard in np.unique(shard_of):
+            first = self.split.manifest.shards[shard].first
+            local = indices[torch.from_numpy(order[shard_of[order] == shard])] - first
+            for name, tensor in self._shard(int(shard)).items():
+                pieces[name].append(tensor[local])
+        back = torch.from_numpy(np.argsort(order))
+        out = {name: torch.cat(rows)[back] for name, rows in pieces.items()}
+        if "part" in out:
+            part = out["part"].long()
+            out["part"] = torch.where(part == UNLABELLED, -1, part)
+        out["index"] = indices.clone()
+        return out
+
+    def _shard(self, number: int) -> dict[str, Tensor]:
+        if number not in self._open:
+            shard = self.split.manifest.shards[number]
+            path = self.split.folder / shard.file
+            read_header(path)
+            expected = self.split.shapes(shard.count)
+            with safe_open(path, "pt") as file:
+                there = set(file.keys())
+                missing = [name for name in self.names if name not in there]
+                if missing:
+                    raise StoreError(f"{path}: expected tensor {missing[0]!r}, found none")
+                tensors = {name: file.get_tensor(name) for name in self.names}
+            for name, tensor in tensors.items():
+                check_shape(path, name, tensor, expected.get(name))
+            self._open[number] = tensors
+        return self._open[number]
+
+
+def dataset(
+    folder: Path | str,
+    category: str | None = None,
+    split: str = "train",
+    names: Sequence[str] = TENSORS,
+) -> SampleDataset:
+    """The samples below `folder`: a data set, a category's or a split's folder.
+
+    Raises:
+        StoreError: No such split, or more than one fits; a broken manifest.
+    """
+    return SampleDataset(open_split(folder, category, split), names)
+
+
+def observe(batch: dict[str, Tensor]) -> Observation:
+    """What a method may see of a batch."""
+    color = batch.get("color")
+    return Observation(points=batch["points"], color=None if color is None else color.float() / 255)
+
+
+def label(batch: dict[str, Tensor]) -> Labels:
+    """The ground truth of a batch, camera frame."""
+    return Labels(
+        part=batch["part"],
+        camera_T_part=batch["camera_T_part"],
+        joints=Joints(
+            pivot=batch["joint_pivot"], axis=batch["joint_axis"], state=batch["joint_state"]
+        ),
+    )
