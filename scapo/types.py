@@ -124,9 +124,9 @@ class Sample:
     key: SampleKey
     observation: Observation
     labels: Labels
-    visible: Float[Tensor, P]  # noqa: F821
+    visible: Float[Tensor, " P"]
     """Share of each part's surface seen in this view."""
-    camera: Float[Tensor, 6]
+    camera: Float[Tensor, " 6"]
     """fx, fy, cx, cy, width, height in pixels."""
 
 
