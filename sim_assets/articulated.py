@@ -81,14 +81,14 @@ class ArticulatedObject:
         )
         return trimesh.Trimesh(vertices, faces, process=False)
 
-    def extents(self) -> Float[np.ndarray, 3]:
+    def extents(self) -> Float[np.ndarray, " 3"]:
         """Sides of the bounding box at rest, m."""
         points = np.concatenate([v.mesh.bounds for part in self.visuals for v in part])
         return points.max(0) - points.min(0)
 
 
 def joint_motion(
-    pivot: Float[np.ndarray, 3], axis: Float[np.ndarray, 3], state: float, kind: str
+    pivot: Float[np.ndarray, " 3"], axis: Float[np.ndarray, " 3"], state: float, kind: str
 ) -> Float[np.ndarray, "4 4"]:
     """`scapo.geometry.joint_motion` for one joint in float64 numpy."""
     motion = np.eye(4)
