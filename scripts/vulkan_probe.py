@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Render one box with SAPIEN, check its depth and print the device's name; fails (or dies) where no Vulkan device works.
+"""Render one cube with SAPIEN, check its depth and print the device's name; fails where none works.
 
-Run in a process of its own, since a broken driver can end it. The picture itself is checked because a device that is
-found need not be one that draws.
+Run in a process of its own, since a broken driver can end it. The picture itself is checked because
+a device that is found need not be one that draws.
 """
 
 from __future__ import annotations

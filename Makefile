@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+# One command each; every target does its own set-up, which is instant when nothing has changed.
+
+SHELL := bash
+BIN := .venv/bin
+# Processes of the test run, with one thread each.
+JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+ARGS ?=
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+export LP_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.PHONY: help setup vulkan demo test test-quick lint format bench lock dist clean
+
+help: ## these lines
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: ## .venv with the locked packages and a Vulkan driver (PYTHON=python3.12, LOCK=requirements-all.lock)
+	@LOCK="$(LOCK)" PYTHON="$(PYTHON)" scripts/setup.sh
+
+vulkan: ## look for a Vulkan device again, and install a driver where there is none
+	@scripts/vulkan.sh
+
+demo: setup ## the whole idea: generate two categories, train, score, print the table, draw pictures
+	@$(BIN)/python -m bench.demo $(ARGS)
+
+test: setup ## all tests, with line coverage (JOBS=2, ARGS="-k geometry")
+	@$(BIN)/python -m pytest -n $(JOBS) --dist loadscope --cov --cov-report=term --durations=8 $(ARGS)
+
+test-quick: setup ## without the slow tests
+	@$(BIN)/python -m pytest -n $(JOBS) --dist loadscope -m "not slow" $(ARGS)
+
+lint: setup ## ruff, pyright, import contracts
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/lint-imports --no-logo
+	@$(BIN)/pyright --warnings
+
+format: setup ## ruff, writing
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+bench: setup ## speed tests
+	@$(BIN)/python -m pytest tests/speed --benchmark-enable --benchmark-only -p no:xdist $(ARGS)
+
+lock: setup ## resolve pyproject.toml anew into the lock files (ARGS=--upgrade)
+	@scripts/lock.sh $(ARGS)
+
+dist: setup ## wheel and sdist in dist/
+	@rm -rf dist
+	@$(BIN)/hatchling build
+
+clean: ## remove .venv, caches and builds; keep results
+	rm -rf .venv build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks .coverage htmlcov
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
