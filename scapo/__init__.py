@@ -1,2 +1,47 @@
 # SPDX-License-Identifier: MIT
-"""Self-supervised pose estimation of articulated objects from one point cloud."""
+"""Self-supervised pose estimation of articulated objects from one point cloud.
+
+The symbols of the paper (SCAPO, CVPR 2026) and their names here:
+
+| paper | here | shape, frame |
+|---|---|---|
+| X | `Observation.points` | (N, 3), camera, m; normalised to mean radius 0.25 inside the method |
+| R_g, t_g | `camera_T_object` of stage 1 | our R is the transpose of the paper's row-vector R_g |
+| S_obj | aligned points | (N, 3), aligned frame: X with the global pose undone |
+| S* | canonical points | (N, 3), aligned frame at the canonical states |
+| Y_base, Delta S_X, Y_X | template, residual, their sum | (M, 3), template frame |
+| w_i, W | `Prediction.part_weight` | (N, P), rows on the simplex |
+| c, d, a | `Joints.pivot`, `.axis`, `.state` | state = child minus parent; the paper keeps one per part |
+| T^[p] | `joint_motion` | 4x4, t = (I - R) c for a revolute joint (corrected) |
+| K, O | keypoints, bone centres | (P, 3) |
+| Theta_E, Theta_D, Theta_J, Theta_K, Theta_Delta | encoder, decoder, joint net, keypoint net, residual net | |
+
+Frames: `camera` is OpenCV (x right, y down, z forward); `object` has z up, the front towards -x and
+its origin at the centre of the bounding box at rest; a part's frame is the object frame at rest,
+carried along by the part. `a_T_b` maps coordinates in b to a; points are rows.
+"""
+
+from scapo.categories import CATEGORIES, category
+from scapo.types import (
+    Category,
+    Joints,
+    JointSpec,
+    Labels,
+    Observation,
+    Prediction,
+    Sample,
+    SampleKey,
+)
+
+__all__ = [
+    "CATEGORIES",
+    "Category",
+    "JointSpec",
+    "Joints",
+    "Labels",
+    "Observation",
+    "Prediction",
+    "Sample",
+    "SampleKey",
+    "category",
+]

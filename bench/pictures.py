@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""Pictures of what a method did: predictions beside the truth, and training curves, as PNG."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from bench.metrics import sample_errors
+from scapo import store
+from scapo.data import UNLABELLED
+from scapo.draw import draw_axis, draw_cloud
+
+TRUE_AXIS, PREDICTED_AXIS = "black", "#cc3311"
+
+NAMES = ("points", "part", "camera_T_part", "joint_pivot", "joint_axis")
+
+
+def predictions_picture(
+    split: store.Split, predictions: Path, out: Path, samples: Sequence[int]
+) -> None:
+    """Two rows: the truth above, the prediction below, one column per sample.
+
+    Parts are coloured by the true part that the evaluator compares each predicted one with;
+    the true axis is drawn dashed and black in both rows, the predicted one red.
+
+    Raises:
+        StoreError: The predictions are not readable or belong to other data.
+    """
+    index = np.asarray(samples)
+    truth = {name: array[index] for name, array in split.arrays(*NAMES).items()}
+    predicted, header = store.read(predictions, store.PREDICTIONS)
+    predicted = {name: array[index] for name, array in predicted.items()}
+    part_true = np.where(truth["part"] == UNLABELLED, -1, truth["part"].astype(np.int64))
+    part_pred = hard_parts(predicted)
+    order = sample_errors(
+        part_true=part_true,
+        camera_T_part_true=truth["camera_T_part"],
+        pivot_true=truth["joint_pivot"],
+        axis_true=truth["joint_axis"],
+        part_pred=part_pred,
+        camera_T_part_pred=None,
+        pivot_pred=None,
+        axis_pred=None,
+    )["order"]
+    figure = Figure(figsize=(1.9 * len(index), 4.3), dpi=130)
+    grid = figure.subplots(2, len(index), squeeze=False)
+    for column in range(len(index)):
+        points = truth["points"][column].astype(np.float64)
+        draw_cloud(grid[0, column], points, part_true[column])
+        draw_cloud(grid[1, column], points, order[column][part_pred[column]])
+        for row in (0, 1):
+            for pivot, axis in zip(
+                truth["joint_pivot"][column], truth["joint_axis"][column], strict=True
+            ):
+                draw_axis(grid[row, column], points, pivot, axis, color=TRUE_AXIS, dashed=True)
+        if "joint_axis" in predicted:
+            pairs = zip(
+                predicted["joint_pivot"][column], predicted["joint_axis"][column], strict=True
+            )
+            for pivot, axis in pairs:
+                draw_axis(grid[1, column], points, pivot, axis, color=PREDICTED_AXIS)
+        grid[0, column].set_title(f"#{index[column]}", fontsize=8)
+    figure.suptitle(
+        f"{header['category']}: truth above, {header['method']} below "
+        "(axis: true dashed, predicted red)",
+        fontsize=10,
+    )
+    figure.tight_layout(rect=(0, 0, 1, 0.96))
+    save(figure, out)
+
+
+def hard_parts(predicted: store.Arrays) -> np.ndarray:
+    """The part of each point (B, N), int64, from `part` or the largest `part_weight`."""
+    if "part" in predicted:
+        return predicted["part"].astype(np.int64)
+    return predicted["part_weight"].argmax(-1)
+
+
+def training_curve(metrics: Path, out: Path) -> None:
+    """Loss terms of a run's metrics.jsonl against the step, one panel per stage."""
+    stages: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
+    for line in metrics.read_text().splitlines():
+        row = json.loads(line)
+        for name, value in row.items():
+            if name.startswith("loss") and isinstance(value, float):
+                stages[str(row.get("stage", ""))][name].append((row["step"], value))
+    figure = Figure(figsize=(5 * max(1, len(stages)), 3.6), dpi=130)
+    panels = figure.subplots(1, max(1, len(stages)), squeeze=False)[0]
+    for panel, (stage, terms) in zip(panels, stages.items(), strict=False):
+        for name, pairs in sorted(terms.items()):
+            steps, values = zip(*pairs, strict=True)
+            panel.plot(steps, values, linewidth=1.2, label=name.removeprefix("loss/"))
+        panel.set_yscale("symlog", linthresh=1e-3)
+        panel.set_title(stage, fontsize=10)
+        panel.set_xlabel("step")
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize=6, ncols=2)
+    figure.tight_layout()
+    save(figure, out)
+
+
+def save(figure: Figure, out: Path) -> None:
+    """Write a PNG under its final name only when complete."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    temporary = out.with_suffix(".tmp.png")
+    with mpl.rc_context({"svg.hashsalt": "scapo"}):
+        figure.savefig(temporary, format="png", metadata={"Software": None})
+    temporary.replace(out)
