@@ -11,10 +11,11 @@ The symbols of the paper (SCAPO, CVPR 2026) and their names here:
 | S* | canonical points | (N, 3), aligned frame at the canonical states |
 | Y_base, Delta S_X, Y_X | template, residual, their sum | (M, 3), template frame |
 | w_i, W | `Prediction.part_weight` | (N, P), rows on the simplex |
-| c, d, a | `Joints.pivot`, `.axis`, `.state` | state = child minus parent; the paper keeps one per part |
+| c, d, a | `Joints.pivot`, `.axis`, `.state` | state = child minus parent (paper: one per part) |
 | T^[p] | `joint_motion` | 4x4, t = (I - R) c for a revolute joint (corrected) |
 | K, O | keypoints, bone centres | (P, 3) |
-| Theta_E, Theta_D, Theta_J, Theta_K, Theta_Delta | encoder, decoder, joint net, keypoint net, residual net | |
+| Theta_E, Theta_D | encoder, decoder | stage 1 |
+| Theta_J, Theta_K, Theta_Delta | joint, keypoint and residual networks | stage 2 |
 
 Frames: `camera` is OpenCV (x right, y down, z forward); `object` has z up, the front towards -x and
 its origin at the centre of the bounding box at rest; a part's frame is the object frame at rest,
