@@ -14,7 +14,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
@@ -30,6 +30,7 @@ PREDICTIONS = "scapo-predictions/1"
 CHECKPOINT = "scapo-checkpoint/1"
 
 
+@runtime_checkable
 class Shaped(Protocol):
     """Anything with a shape: numpy or torch."""
 
