@@ -97,7 +97,7 @@ main() {
   make_venv
   rm -f "$VENV/setup.done"
   install_torch
-  say "$(grep -cE '^[a-z]' "$LOCK") packages of $LOCK"
+  say "the packages of $LOCK"
   try_pip -r "$LOCK"
   try_pip --no-deps --no-build-isolation -e .
   scripts/vulkan.sh "$VENV/bin/python"

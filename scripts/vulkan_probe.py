@@ -32,7 +32,7 @@ def main() -> None:
     device = first_device()
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
     builder = scene.create_actor_builder()
-    builder.add_box_visual(half_size=[HALF_SIZE] * 3)
+    builder.add_box_visual(half_size=(HALF_SIZE, HALF_SIZE, HALF_SIZE))
     builder.build_kinematic(name="cube").set_pose(sapien.Pose([DISTANCE, 0, 0]))
     camera = scene.add_camera("camera", width=16, height=16, fovy=1.0, near=0.1, far=10.0)
     scene.update_render()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-# One thread each: tests run in as many processes as there are cores. Before numpy and torch are imported.
+# One thread each, set before numpy and torch are imported: tests run in one process per core.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -23,7 +23,7 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """The folder `shared` beside the repository (metric fixtures, real models); skips where there is none."""
+    """The folder `shared` beside the repository (fixtures, real models); skips where absent."""
     folder = REPOSITORY.parent / "shared"
     if not (folder / "fixtures").is_dir():
         pytest.skip(f"no folder {folder.name!r} with fixtures beside the repository")
@@ -32,7 +32,7 @@ def shared_dir() -> Path:
 
 @pytest.fixture(scope="session")
 def update_golden(request: pytest.FixtureRequest) -> bool:
-    """Whether golden files are to be written anew: `pytest --update-golden`; review the difference."""
+    """Whether to write golden files anew: `pytest --update-golden`; review the difference."""
     return bool(request.config.getoption("--update-golden"))
 
 
