@@ -4,11 +4,49 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from dataclasses import dataclass
 from typing import ClassVar
 
+import torch
 from torch import Tensor, nn
 
 from scapo.types import Category, Labels, Observation, Prediction, Supervision
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterGroup:
+    """Parameters that a stage trains, by the method's attribute that holds them."""
+
+    module: str
+    """Name of a submodule or parameter of the method, "" for all of it."""
+    rate: float = 1.0
+    """Factor on the stage's learning rate."""
+    begin: float = 0.0
+    """Share of the stage that passes before these parameters are updated at all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stage:
+    """One run of the optimiser: Adam, the learning rate on half a cosine from `lr` to `min_lr`."""
+
+    name: str
+    epochs: int
+    lr: float
+    min_lr: float = 1e-6
+    weight_decay: float = 1e-8
+    batch: int = 16
+    parameters: tuple[ParameterGroup, ...] = (ParameterGroup(module=""),)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """Where in the training a batch is, and the randomness it may use."""
+
+    stage: str
+    progress: float
+    """Share of the stage that is done, in [0, 1)."""
+    generator: torch.Generator
+    """On the device of the batch; the only source of randomness in `losses`."""
 
 
 class AbstractMethod(nn.Module):
@@ -23,15 +61,33 @@ class AbstractMethod(nn.Module):
     supervision: frozenset[Supervision]
 
     @abstractmethod
-    def losses(
-        self, observation: Observation, labels: Labels, progress: float
-    ) -> dict[str, Tensor]:
+    def stages(self) -> tuple[Stage, ...]:
+        """The stages of training, in order; none for a method without parameters."""
+
+    @abstractmethod
+    def start(
+        self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> None:
+        """Prepare a stage from the whole training split, such as a template from its medoid.
+
+        Called once at the beginning of each stage, not again on resume: what it sets must be
+        in the state dict. A method without stages is called once, with stage "".
+
+        Args:
+            stage: Its name.
+            observation: All training clouds, camera frame, metres.
+            labels: As allowed by `supervision`.
+            generator: On the device of the clouds.
+        """
+
+    @abstractmethod
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """Weighted scalar terms of the loss; their sum is minimised.
 
         Args:
             observation: A batch, camera frame, metres.
             labels: As allowed by `supervision`.
-            progress: Share of the current stage that is done, in [0, 1].
+            step: Stage, progress and randomness.
         """
 
     @abstractmethod
