@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""Procedural articulated objects: one module per category, one function to make an instance.
+
+`generate` is a pure function of its arguments. Training, validation and test shapes come from one
+distribution and never coincide; `test-ood` shapes have a combination of details that training never
+shows and half of their proportions outside the training ranges.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sim_assets.articulated import ArticulatedObject
+from sim_assets.procedural import laptop
+from sim_assets.procedural.assembly import VERSION, Design, assemble, digest
+from sim_assets.procedural.parameters import HeldOut, draw
+
+SPLITS = ("train", "val", "test", "test-ood")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """How a category is made."""
+
+    shape: type
+    """Dataclass of its free parameters."""
+    build: Callable[[Any], Design]
+    held_out: HeldOut
+    symmetric: Mapping[str, object] | None = None
+    """Parameters that make the category's swap symmetry exact; None if it has none."""
+
+
+RECIPES: dict[str, Recipe] = {
+    "laptop": Recipe(
+        shape=laptop.LaptopShape,
+        build=laptop.build,
+        held_out=laptop.HELD_OUT,
+        symmetric=laptop.SYMMETRIC,
+    ),
+}
+
+
+def recipe(category: str) -> Recipe:
+    """The recipe of a category.
+
+    Raises:
+        ValueError: There is none; the message lists those that are.
+    """
+    if category not in RECIPES:
+        raise ValueError(f"category {category!r}: expected one of {', '.join(RECIPES)}")
+    return RECIPES[category]
+
+
+def _generator(*key: object) -> np.random.Generator:
+    """A generator seeded by a SHA-256 of the key: equal keys, equal numbers, on every machine."""
+    text = json.dumps([VERSION, *key])
+    seed = int.from_bytes(hashlib.sha256(text.encode()).digest(), "little")
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+
+
+def draw_shape(category: str, split: str, seed: int, index: int) -> Any:  # noqa: ANN401
+    """The parameters of an instance, a dataclass of the category's own."""
+    made = recipe(category)
+    if split not in SPLITS:
+        raise ValueError(f"split {split!r}: expected one of {', '.join(SPLITS)}")
+    rng = _generator(category, split, int(seed), int(index))
+    return draw(made.shape, rng, held_out=made.held_out, unseen=split == "test-ood")
+
+
+def generate(category: str, split: str, seed: int, index: int) -> ArticulatedObject:
+    """One instance, `<category>-<split>-<seed>-<index>`, a pure function of the arguments.
+
+    Args:
+        category: One of `RECIPES`.
+        split: train, val, test or test-ood.
+        seed: Of the data set, >= 0.
+        index: Within the split, >= 0.
+
+    Raises:
+        ValueError: Unknown category or split, or a negative number.
+    """
+    if seed < 0 or index < 0:
+        raise ValueError(f"seed and index: expected numbers >= 0, found {seed} and {index}")
+    shape = draw_shape(category, split, seed, index)
+    return assemble(
+        category,
+        f"{category}-{split}-{seed}-{index:05d}",
+        recipe(category).build(shape),
+        f"procedural/{category}/{split}/{seed}/{index}",
+        digest(shape),
+    )
+
+
+def generate_symmetric(category: str, seed: int = 0) -> ArticulatedObject:
+    """An instance that its category's swap symmetry maps onto itself, parts exchanged.
+
+    Raises:
+        ValueError: The category has no swap symmetry.
+    """
+    made = recipe(category)
+    if made.symmetric is None:
+        raise ValueError(f"category {category!r}: expected one with a swap symmetry")
+    drawn = draw(made.shape, _generator(category, "symmetric", seed))
+    shape = replace(drawn, **made.symmetric)
+    source = f"procedural/{category}/symmetric/{seed}"
+    return assemble(
+        category, f"{category}-symmetric-{seed}", made.build(shape), source, digest(shape)
+    )
