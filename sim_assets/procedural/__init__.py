@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.procedural import laptop
+from sim_assets.procedural import laptop, oven
 from sim_assets.procedural.assembly import VERSION, Design, assemble, digest
 from sim_assets.procedural.parameters import HeldOut, draw
 
@@ -43,6 +43,7 @@ RECIPES: dict[str, Recipe] = {
         held_out=laptop.HELD_OUT,
         symmetric=laptop.SYMMETRIC,
     ),
+    "oven": Recipe(shape=oven.OvenShape, build=oven.build, held_out=oven.HELD_OUT),
 }
 
 

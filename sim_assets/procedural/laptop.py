@@ -70,7 +70,7 @@ class LaptopShape:
     strips: bool = chance(0.3)
     """Speaker strips beside the keyboard."""
     rows: int = choice(5, 6)
-    body_color: RGB = tint(
+    body_color: tuple[float, float, float] = tint(
         (0.75, 0.76, 0.78),
         (0.2, 0.2, 0.22),
         (0.45, 0.46, 0.5),
@@ -78,8 +78,12 @@ class LaptopShape:
         (0.25, 0.3, 0.4),
         (0.7, 0.3, 0.3),
     )
-    key_color: RGB = tint((0.1, 0.1, 0.1), (0.85, 0.85, 0.85), (0.25, 0.25, 0.27))
-    display_color: RGB = tint((0.07, 0.08, 0.1), (0.15, 0.25, 0.45), (0.1, 0.3, 0.3))
+    key_color: tuple[float, float, float] = tint(
+        (0.1, 0.1, 0.1), (0.85, 0.85, 0.85), (0.25, 0.25, 0.27)
+    )
+    display_color: tuple[float, float, float] = tint(
+        (0.07, 0.08, 0.1), (0.15, 0.25, 0.45), (0.1, 0.3, 0.3)
+    )
     plain: bool = False
     """Two equal slabs and nothing else: has the category's swap symmetry exactly."""
 
@@ -95,7 +99,7 @@ class LaptopShape:
 
     @property
     def middle(self) -> float:
-        """x of the base's middle."""
+        """The x of the base's middle."""
         return -self.rear - self.depth / 2
 
 
