@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: MIT
+"""Joint states and cameras: uniform in the category's travel and viewing window (CONTRACT 4).
+
+The camera stands in the window, seen from the origin of the object frame; its distance is solved so
+that the box around the object's image fills the drawn share of the image, and its gaze is turned so
+that this box lies at the drawn place. Roll is uniform, since poses are arbitrary in SE(3).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+from scapo.camera import Intrinsics
+from scapo.types import Window
+from sim_assets.articulated import ArticulatedObject
+
+TRAVEL = (0.15, 0.95)
+"""States are drawn from this share of the travel."""
+FILL = (0.5, 0.9)
+"""The longer side of the object's image, as a share of the image's side."""
+FILL_MARGIN = 0.005
+"""Kept from both ends of FILL, so that whole pixels stay inside it too."""
+JITTER = 0.05
+"""Largest offset of the box's centre from the image's centre, as a share of the image's side."""
+STEPS = 7
+"""Of the fixed-point iteration that frames the object; 4e-4 of the image is left at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """One camera, and the states that are seen from it."""
+
+    states: Float[np.ndarray, "K J"]
+    """rad or m."""
+    camera_T_object: Float[np.ndarray, "4 4"]
+
+
+def generator(*key: object) -> np.random.Generator:
+    """A generator seeded by the SHA-256 of the key: the same numbers on every machine."""
+    text = json.dumps(key, separators=(",", ":"))
+    words = np.frombuffer(hashlib.sha256(text.encode()).digest(), "<u4")
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words.tolist())))
+
+
+class Outline:
+    """The points of each part that can lie on the outline of its image: its convex hull's."""
+
+    def __init__(self, thing: ArticulatedObject) -> None:
+        self.thing = thing
+        self.parts = [
+            hull_points(np.asarray(thing.part_mesh(part).vertices))
+            for part in range(len(thing.visuals))
+        ]
+
+    def posed(self, states: Float[np.ndarray, "K J"]) -> Float[np.ndarray, "V 3"]:
+        """The outline points in the object frame at all of these states together."""
+        moved = [self.parts[0]]
+        for state in states:
+            poses = self.thing.pose(state)
+            moved += [
+                points @ pose[:3, :3].T + pose[:3, 3]
+                for points, pose in zip(self.parts[1:], poses[1:], strict=True)
+            ]
+        return np.concatenate(moved)
+
+
+def hull_points(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "_ 3"]:
+    """The points on the convex hull; all distinct points where they lie in a plane."""
+    distinct = np.unique(points, axis=0)
+    try:
+        return distinct[ConvexHull(distinct).vertices]
+    except (QhullError, ValueError):
+        return distinct
+
+
+def draw_views(
+    outline: Outline, rngs: Sequence[np.random.Generator], camera: Intrinsics, states: int = 1
+) -> list[View]:
+    """For each generator, draw states and a camera that frames the object in all of them.
+
+    Views are framed together, which is many times faster than one by one; each is a function of
+    its own generator alone.
+    """
+    thing = outline.thing
+    drawn, turns, fills, centres = [], [], [], []
+    for rng in rngs:
+        drawn.append(rng.uniform(*TRAVEL, size=(states, len(thing.upper))) * thing.upper)
+        direction = draw_direction(thing.category.window, rng)
+        turns.append(look_along(-direction, rng.uniform(-np.pi, np.pi)))
+        fills.append(rng.uniform(FILL[0] + FILL_MARGIN, FILL[1] - FILL_MARGIN))
+        centres.append(rng.uniform(-1, 1, size=2) * min(JITTER, 0.4 * (1 - fills[-1])))
+    points = np.stack([outline.posed(state) for state in drawn])
+    poses = frame_objects(points, np.stack(turns), camera, np.array(fills), np.stack(centres))
+    return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
+
+
+def draw_direction(window: Window, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """Unit vector from the object to the camera, uniform on the window's piece of the sphere."""
+    azimuth = radians(rng.uniform(*window.azimuth))
+    z = rng.uniform(*np.sin(np.radians(window.elevation)))
+    level = np.sqrt(1 - z * z)
+    return np.array([-level * np.cos(azimuth), -level * np.sin(azimuth), z])
+
+
+def direction_angles(direction: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 2"]:
+    """Azimuth and elevation in degrees (`Window`) of vectors from the object to the camera."""
+    azimuth = np.arctan2(-direction[..., 1], -direction[..., 0])
+    elevation = np.arctan2(direction[..., 2], np.hypot(direction[..., 0], direction[..., 1]))
+    return np.degrees(np.stack([azimuth, elevation], -1))
+
+
+def look_along(gaze: Float[np.ndarray, "3"], roll: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation to a camera frame with z along `gaze`, x level, then rolled about z."""
+    level = np.cross(gaze, [0.0, 0.0, 1.0])
+    if np.linalg.norm(level) < 1e-6:
+        level = np.array([0.0, -1.0, 0.0])  # straight down or up: x to the object's right
+    x = level / np.linalg.norm(level)
+    y = np.cross(gaze, x)
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * x + s * y, c * y - s * x, gaze])
+
+
+def frame_objects(
+    points: Float[np.ndarray, "B V 3"],
+    rotation: Float[np.ndarray, "B 3 3"],
+    camera: Intrinsics,
+    fill: Float[np.ndarray, " B"],
+    centre: Float[np.ndarray, "B 2"],
+) -> Float[np.ndarray, "B 4 4"]:
+    """camera_T_object with the image of `points` in a box of share `fill`, offset by `centre`.
+
+    The camera stands on the line through the object's origin along the third row of `rotation`
+    and is turned towards the box. Element-wise arithmetic only: a matrix product's last digits
+    depend on the machine and on how many views are framed together.
+
+    Args:
+        points: Object frame, m.
+        rotation: Camera frame from object frame before the gaze is turned.
+        camera: Intrinsics.
+        fill: Longer side of the box as a share of the image's side (width or height).
+        centre: Offset of the box's centre from the image's, as shares of the image's sides.
+    """
+    size = np.array([camera.width, camera.height])
+    focal = np.array([camera.fx, camera.fy])
+    middle = (0.5 + centre) * size - (camera.cx, camera.cy)
+    aim = _with_one(middle / focal)  # the ray on which the box's centre shall lie
+    radius = np.sqrt((points**2).sum(-1).max(-1))
+    base = _product(rotation, points)
+    distance, turn = 2.5 * radius, np.tile(np.eye(3), (len(points), 1, 1))
+    for _ in range(STEPS):
+        ahead = np.stack([base[..., 0], base[..., 1], base[..., 2] + distance[:, None]], -1)
+        seen = _product(turn, ahead)
+        behind = seen[..., 2].min(-1) < 0.02 * radius
+        seen[behind, :, 2] = 1.0  # their step is to go back; what follows is not used
+        low, high, depth = _image_box(seen)
+        share = (high - low) * focal / size
+        longer = share.argmax(-1)[:, None]
+        excess = np.take_along_axis(share, longer, -1)[:, 0] / fill - 1
+        step = np.take_along_axis(depth, longer, -1)[:, 0] * excess
+        distance = np.where(behind, 1.5 * distance, distance + step)
+        wanted = _turn(_with_one((low + high) / 2), aim)
+        turn = np.where(behind[:, None, None], turn, _compose(wanted, turn))
+    pose = np.tile(np.eye(4), (len(points), 1, 1))
+    pose[:, :3, :3] = _compose(turn, rotation)
+    pose[:, :3, 3] = turn[..., 2] * distance[:, None]
+    return pose
+
+
+def _image_box(
+    seen: Float[np.ndarray, "B V 3"],
+) -> tuple[Float[np.ndarray, "B 2"], Float[np.ndarray, "B 2"], Float[np.ndarray, "B 2"]]:
+    """Least and greatest x/z and y/z, and the mean depth of the two points that span each."""
+    flat = seen[..., :2] / seen[..., 2:]
+    first, last = flat.argmin(1), flat.argmax(1)
+    low = np.take_along_axis(flat, first[:, None], 1)[:, 0]
+    high = np.take_along_axis(flat, last[:, None], 1)[:, 0]
+    z = seen[..., 2]
+    depth = np.take_along_axis(z, first, 1) + np.take_along_axis(z, last, 1)
+    return low, high, depth / 2
+
+
+def _product(
+    matrix: Float[np.ndarray, "B 3 3"], points: Float[np.ndarray, "B V 3"]
+) -> Float[np.ndarray, "B V 3"]:
+    """matrix @ point for each point, element by element."""
+    columns = [points[..., k, None] * matrix[:, None, :, k] for k in range(3)]
+    return columns[0] + columns[1] + columns[2]
+
+
+def _compose(
+    a: Float[np.ndarray, "B 3 3"], b: Float[np.ndarray, "B 3 3"]
+) -> Float[np.ndarray, "B 3 3"]:
+    terms = [a[:, :, k, None] * b[:, None, k, :] for k in range(3)]
+    return terms[0] + terms[1] + terms[2]
+
+
+def _with_one(flat: Float[np.ndarray, "B 2"]) -> Float[np.ndarray, "B 3"]:
+    return np.concatenate([flat, np.ones((len(flat), 1))], -1)
+
+
+def _turn(
+    source: Float[np.ndarray, "B 3"], target: Float[np.ndarray, "B 3"]
+) -> Float[np.ndarray, "B 3 3"]:
+    """The smallest rotation between two directions less than half a turn apart (Rodrigues)."""
+    a = source / np.sqrt((source**2).sum(-1, keepdims=True))
+    b = target / np.sqrt((target**2).sum(-1, keepdims=True))
+    x, y, z = np.cross(a, b).T
+    zero = np.zeros_like(x)
+    skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
+    factor = 1 / (1 + (a * b).sum(-1))
+    return np.eye(3) + skew + _compose(skew, skew) * factor[:, None, None]
