@@ -10,7 +10,7 @@ from typing import cast
 
 import roma
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from scapo.types import JointKind
@@ -55,24 +55,36 @@ def joint_motion(
         state: rad or m.
         kind: Of the joint.
     """
-    step = axis * state[..., None]
+    step, pivot = torch.broadcast_tensors(axis * state[..., None], pivot)
     if kind == "prismatic":
         eye = torch.eye(3, dtype=step.dtype, device=step.device).expand(*step.shape[:-1], 3, 3)
         return rigid(eye, step)
     rotation = roma.rotvec_to_rotmat(step)
-    pivot = pivot.expand(step.shape)
     return rigid(rotation, pivot - (rotation @ pivot[..., None])[..., 0])
 
 
 def rotation_angle(a: Float[Tensor, "*B 3 3"], b: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B"]:
-    """Geodesic angle between two rotations in radians, exact near 0 and pi (roma, by atan2)."""
-    return roma.rotmat_geodesic_distance(a, b)
+    """Geodesic angle between two rotations in radians.
+
+    By atan2 of the sine (skew part of a^T b) and the cosine (trace): accurate to rounding from
+    0 to pi with finite gradients everywhere, where arccos loses half the digits near 0 and the
+    arcsin of half the chord near pi.
+    """
+    turn = a.mT @ b
+    skew = torch.stack([turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
+    trace = turn.diagonal(dim1=-2, dim2=-1).sum(-1)
+    return torch.atan2(skew.norm(dim=-1), trace - 1)
 
 
 def axis_angle(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
-    """Angle between two undirected lines in radians, [0, pi/2]; axes of any length."""
+    """Angle between two undirected lines in radians, [0, pi/2]; axes of any length but 0.
+
+    An axis of length 0 has no direction: NaN, not a perfect score.
+    """
     sine = torch.linalg.cross(a, b).norm(dim=-1)
-    return torch.atan2(sine, (a * b).sum(-1).abs())
+    cosine = (a * b).sum(-1).abs()
+    undefined = (a == 0).all(-1) | (b == 0).all(-1)
+    return torch.where(undefined, torch.nan, torch.atan2(sine, cosine))
 
 
 def point_line_distance(
@@ -88,20 +100,34 @@ def rotation_between(
     """The smallest rotation R with R source = target, for unit vectors (Sec. 3.2, R_r).
 
     Rodrigues in the form I + [v] + [v]^2 / (1 + c), v = source x target, c = source . target,
-    which needs no angle and is exact for equal vectors. For opposite vectors, where every
-    half turn about a normal will do, the normal is fixed by the smallest component of `source`.
+    which needs no angle and is exact for equal vectors. As 1 + c loses its digits towards
+    opposite vectors, obtuse angles begin with half a turn about v, which takes source to
+    -source, and go on from there by the acute rest. Within 1e-3 rad of opposite, v has no
+    direction of its own to rely on: the half turn is about a normal that the smallest component
+    of `source` fixes. R source = target holds to rounding throughout.
     """
-    cross = torch.linalg.cross(source, target)
-    cosine = (source * target).sum(-1)
-    opposite = cosine < -1 + 1e-6
-    skew = skew_matrix(cross)
     eye = torch.eye(3, dtype=source.dtype, device=source.device)
-    safe = torch.where(opposite, torch.ones_like(cosine), 1 + cosine)
-    rotation = eye + skew + skew @ skew / safe[..., None, None]
+    obtuse = ((source * target).sum(-1) < 0)[..., None]
+    turn = torch.where(obtuse[..., None], _half_turn(source, target), eye)
+    start = torch.where(obtuse, -source, source)
+    skew = skew_matrix(torch.linalg.cross(start, target))
+    cosine = (start * target).sum(-1)[..., None, None]
+    return (eye + skew + skew @ skew / (1 + cosine)) @ turn
+
+
+def _half_turn(
+    source: Float[Tensor, "*B 3"], target: Float[Tensor, "*B 3"]
+) -> Float[Tensor, "*B 3 3"]:
+    """Half a turn about source x target; about any normal of `source` where that is near 0."""
+    cross = torch.linalg.cross(source, target)
     smallest = torch.nn.functional.one_hot(source.abs().argmin(-1), 3).to(source.dtype)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(source, smallest), dim=-1)
-    half_turn = 2 * normal[..., :, None] * normal[..., None, :] - eye
-    return torch.where(opposite[..., None, None], half_turn, rotation)
+    degenerate = cross.square().sum(-1, keepdim=True) < 1e-6
+    normal = torch.where(degenerate, torch.linalg.cross(source, smallest), cross)
+    # Rounding tilts a short cross product; R source = target needs a normal at a right angle.
+    normal = normal - (normal * source).sum(-1, keepdim=True) * source
+    normal = torch.nn.functional.normalize(normal, dim=-1)
+    eye = torch.eye(3, dtype=source.dtype, device=source.device)
+    return 2 * normal[..., :, None] * normal[..., None, :] - eye
 
 
 def skew_matrix(v: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
@@ -134,8 +160,9 @@ def random_rotations(
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
 
 
-def is_rotation(matrix: Shaped[Tensor, "*B 3 3"], tolerance: float = 1e-3) -> Shaped[Tensor, "*B"]:
+def is_rotation(matrix: Float[Tensor, "*B 3 3"], tolerance: float = 1e-3) -> Bool[Tensor, "*B"]:
     """Whether R R^T = I within `tolerance` per entry and det > 0; False for NaN."""
+    matrix = matrix.double()  # no determinant in half precision on the CPU
     eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
     orthogonal = ((matrix @ matrix.mT - eye).abs() < tolerance).all(-1).all(-1)
     return orthogonal & (torch.linalg.det(matrix) > 0)

@@ -7,6 +7,8 @@ gradient is the same and no (N, M) matrix is kept for the backward pass.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -20,24 +22,66 @@ def nearest(
 ) -> Int[Tensor, "*B N"]:
     """Index into `target` of the nearest neighbour of each source point.
 
-    Works on |t|^2 - 2 s.t, one matrix product, with the clouds moved to the target's centroid
-    first: without that, coordinates a metre off cost float32 three digits.
+    Raises:
+        ValueError: `target` has no points.
     """
-    centre = target.mean(-2, keepdim=True)
-    source, target = source - centre, target - centre
-    score = torch.matmul(source, target.mT).mul_(-2).add_(target.square().sum(-1)[..., None, :])
-    return score.argmin(-1)
+    return _search(source, target, 1)[..., 0]
 
 
 @torch.no_grad()
 def k_nearest(
     source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"], k: int
 ) -> Int[Tensor, "*B N {k}"]:
-    """Indices into `target` of the k nearest neighbours of each source point, nearest first."""
-    centre = target.mean(-2, keepdim=True)
-    source, target = source - centre, target - centre
-    score = torch.matmul(source, target.mT).mul_(-2).add_(target.square().sum(-1)[..., None, :])
-    return score.topk(k, dim=-1, largest=False).indices
+    """Indices into `target` of the k nearest neighbours of each source point, nearest first.
+
+    Raises:
+        ValueError: `target` has fewer than k points.
+    """
+    return _search(source, target, k)
+
+
+def _search(
+    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"], k: int
+) -> Int[Tensor, "*B N {k}"]:
+    """The k smallest scores |t|^2 - 2 s.t of each row, a block of the score matrix at a time.
+
+    The clouds are moved to the target's centroid first: without that, coordinates a metre off
+    cost float32 three digits. Half precision is searched in float32.
+    """
+    n, m = source.shape[-2], target.shape[-2]
+    if not 1 <= k <= m:
+        raise ValueError(f"neighbours: expected 1 to {m}, the points of the target, found {k}")
+    clouds = math.prod(source.shape[:-2])
+    dtype = torch.promote_types(source.dtype, torch.float32)
+    centre = target.to(dtype).mean(-2, keepdim=True)
+    source, target = source.to(dtype) - centre, target.to(dtype) - centre
+    left = torch.cat([source, torch.ones_like(source[..., :1])], -1)
+    right = torch.cat([-2 * target, target.square().sum(-1, keepdim=True)], -1).mT
+    found = [
+        scores.argmin(-1, keepdim=True) if k == 1 else scores.topk(k, largest=False).indices
+        for scores in _products(left.reshape(clouds, n, 4), right.reshape(clouds, 4, m))
+    ]
+    rows = [index.reshape(-1, k) for index in found]
+    empty = torch.zeros(0, k, dtype=torch.long, device=source.device)
+    return torch.cat([empty, *rows]).reshape(*source.shape[:-1], k)
+
+
+BLOCK = 1 << 19
+"""Scores held at a time on the CPU: 2 MiB in float32, about a core's cache."""
+
+
+def _products(
+    left: Float[Tensor, "B N 4"], right: Float[Tensor, "B 4 M"]
+) -> Iterator[Float[Tensor, "_ _ M"]]:
+    """The product left @ right, in order, as many clouds, or rows of one, at a time as fit."""
+    n, m = left.shape[1], right.shape[2]
+    block = BLOCK if left.device.type == "cpu" else 128 * BLOCK
+    clouds, rows = max(1, block // max(1, n * m)), max(1, block // m)
+    # Autocast would multiply in half precision and find the wrong neighbours.
+    with torch.autocast(left.device.type, enabled=False):
+        for some, others in zip(left.split(clouds), right.split(clouds), strict=True):
+            for part in some.split(rows, dim=1):
+                yield part @ others
 
 
 def gather(points: Float[Tensor, "*B M C"], index: Int[Tensor, "*B K"]) -> Float[Tensor, "*B K C"]:
@@ -78,7 +122,15 @@ def robust_chamfer(
 def farthest_points(
     points: Float[Tensor, "*B N 3"], count: int, *, start: int = 0
 ) -> Int[Tensor, "*B {count}"]:
-    """Indices of farthest-point sampling, beginning with point `start`."""
+    """Indices of farthest-point sampling, beginning with point `start`.
+
+    Raises:
+        ValueError: The cloud has fewer than `count` points, or no point `start`.
+    """
+    if not 1 <= count <= points.shape[-2]:
+        raise ValueError(f"sampling: expected 1 to {points.shape[-2]} points, found {count}")
+    if not 0 <= start < points.shape[-2]:
+        raise ValueError(f"sampling: expected a start below {points.shape[-2]}, found {start}")
     chosen = torch.full(points.shape[:-2], start, device=points.device)
     distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
     indices = [chosen]
@@ -125,7 +177,12 @@ def normalise(points: Float[Tensor, "*B N 3"]) -> tuple[Float[Tensor, "*B N 3"],
     """
     centre = points.mean(-2)
     radius = (points - centre[..., None, :]).norm(dim=-1).mean(-1)
-    if not bool((torch.isfinite(radius) & (radius > 0)).all()):
-        raise ValueError("cloud: expected finite points that differ, found mean radius 0 or NaN")
+    # Equal points a metre away have a radius of rounding error, not of 0.
+    rounding = 8 * torch.finfo(points.dtype).eps * centre.norm(dim=-1)
+    if not bool((torch.isfinite(radius) & (radius > rounding)).all()):
+        raise ValueError(
+            "cloud: expected finite points that differ, found mean radius "
+            f"{radius.flatten().tolist()[:8]} about {centre.reshape(-1, 3).tolist()[:8]}"
+        )
     similarity = Similarity(scale=MEAN_RADIUS / radius, centre=centre)
     return similarity.forward(points), similarity

@@ -42,3 +42,11 @@ def rigid_motions(seed: int, *shape: int, dtype: torch.dtype = torch.float64) ->
     motions[..., :3, :3] = rotations(seed, *shape, dtype=dtype)
     motions[..., :3, 3] = normal(seed + 1, *shape, 3, dtype=dtype)
     return motions
+
+
+def joints(
+    seed: int, *shape: int, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Pivots of about a metre, unit axes and states in (-pi, pi): (*shape, 3) twice, (*shape)."""
+    state = (torch.rand(shape, generator=generator(seed + 2), dtype=dtype) * 2 - 1) * torch.pi
+    return normal(seed, *shape, 3, dtype=dtype), unit_vectors(seed + 1, *shape, dtype=dtype), state
