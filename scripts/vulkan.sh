@@ -11,7 +11,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 PYTHON="${1:-.venv/bin/python}"
 # 22.3 of Debian 12 lacks VK_KHR_external_memory_fd for the CPU device; 24.3 and later have it.
-PACKAGES=(libvulkan1 mesa-vulkan-drivers)
+# SAPIEN itself is linked with libX11.
+PACKAGES=(libvulkan1 libx11-6 mesa-vulkan-drivers)
 
 say() { printf 'vulkan: %s\n' "$*"; }
 
@@ -59,7 +60,7 @@ main() {
   trap 'root rm -rf "$work" 2>/dev/null || rm -rf "$work"' EXIT
   chmod 755 "$work" # apt reads it as user _apt
 
-  if ! "$PYTHON" -c 'import sapien' >/dev/null 2>&1; then
+  if ! "$PYTHON" -c 'import importlib.util as u, sys; sys.exit(u.find_spec("sapien") is None)'; then
     fall_back "sapien is not installed for $PYTHON"
   fi
   if can_render; then
