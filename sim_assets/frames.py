@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""The object frame of a model: z up, front towards -x, metres, centre of the box at rest.
+
+Where neither the caller nor the source says where the front is, it is told from the joint:
+
+- a door or drawer: where it moves to when it begins to open; a lid that opens upwards: from its
+  hinge towards its middle, as a laptop's user sits opposite to the hinge;
+- eyeglasses: from the temples' middles to their hinges;
+- basket: so that the handles' hinges run along x;
+- scissors: z is the axis (on the side that is up), the blades run along x.
+
+Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
+Left is what is left of one who looks out of the front, -y: the wearer's left of eyeglasses.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from scapo.types import Category
+from sim_assets.validate import Repairs, refuse
+
+AXES = ("x", "y", "z")
+ABSURD = 4.0
+"""A metric model larger or smaller than its category's nominal diagonal by this is rescaled."""
+
+Vector = Float[np.ndarray, " 3"]
+
+
+def direction(name: str, path: Path) -> Vector:
+    """The unit vector of "x", "+x", "-x", "y", ...
+
+    Raises:
+        AssetError: Another word.
+    """
+    clean = name.strip().lower()
+    if clean.lstrip("+-") not in AXES or len(clean) > 2:
+        raise refuse(path, "a direction out of x, -x, y, -y, z, -z", repr(name))
+    sign = -1.0 if clean.startswith("-") else 1.0
+    return sign * np.eye(3)[AXES.index(clean[-1])]
+
+
+def name_of(vector: Vector) -> str:
+    """The nearest of x, -x, y, ..."""
+    k = int(np.abs(vector).argmax())
+    return ("-" if vector[k] < 0 else "") + AXES[k]
+
+
+def basis(up: Vector, front: Vector, path: Path) -> Float[np.ndarray, "3 3"]:
+    """The rotation object_R_asset that turns `up` to z and `front` to -x.
+
+    Raises:
+        AssetError: They are not at right angles.
+    """
+    if abs(up @ front) > 1e-6:
+        raise refuse(path, "a front at right angles to up", f"{name_of(front)} and {name_of(up)}")
+    return np.stack([-front, np.cross(up, -front), up])
+
+
+def snapped(vector: Vector, up: Vector) -> Vector:
+    """The root link's axis nearest to a direction, of those at right angles to up."""
+    level = np.where(np.abs(up) > 0.5, 0.0, vector)
+    k = int(np.abs(level).argmax())
+    return np.sign(level[k] or 1.0) * np.eye(3)[k]
+
+
+def infer_front(
+    category: Category,
+    up: Vector,
+    pivot: Float[np.ndarray, "J 3"],
+    axis: Float[np.ndarray, "J 3"],
+    middle: Float[np.ndarray, "J 3"],
+) -> Vector:
+    """Where a model's front is, by the rules above.
+
+    Args:
+        category: Says which rule.
+        up: Unit, root link.
+        pivot: On the axes at rest, root link.
+        axis: Unit; positive motion opens.
+        middle: Centre of each moving part at rest.
+    """
+    if category.joints[0].kind == "prismatic":
+        return snapped(axis[0], up)
+    if len(category.joints) > 1:
+        return snapped((pivot - middle).mean(0), up)
+    motion = np.cross(axis[0], middle[0] - pivot[0])
+    level = motion - up * (motion @ up)
+    if np.linalg.norm(level) > 0.5 * np.linalg.norm(motion):
+        return snapped(level, up)
+    return snapped(middle[0] - pivot[0] - axis[0] * (axis[0] @ (middle[0] - pivot[0])), up)
+
+
+def long_axis(points: Float[np.ndarray, "N 3"], normal: Vector) -> Vector:
+    """The long side of the smallest rectangle about points seen along a normal."""
+    first = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    flat = points @ np.stack([first, second], 1)
+    turns = np.linspace(0, np.pi / 2, 361)[:-1]
+    sides = [np.ptp(flat @ _turn(t), axis=0) for t in turns]
+    best = int(np.argmin([a * b for a, b in sides]))
+    a, b = _turn(turns[best])[:, int(sides[best][1] > sides[best][0])]
+    return a * first + b * second
+
+
+def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def metres_per_unit(
+    category: Category, size: float, metric: bool, wanted: float | None, repairs: Repairs
+) -> float:
+    """The scale: the caller's, 1 for metric models of sane size, else to the nominal diagonal.
+
+    Args:
+        category: Has the nominal diagonal.
+        size: Diagonal of the box at rest in asset units.
+        metric: Whether the source says that its unit is the metre.
+        wanted: The caller's scale.
+        repairs: Told when a metric model is rescaled.
+    """
+    if wanted is not None:
+        return wanted
+    ratio = size / category.diagonal
+    if metric and 1 / ABSURD <= ratio <= ABSURD:
+        return 1.0
+    if metric:
+        repairs.add(
+            f"A diagonal of {size:.3g} is no size in metres for the category "
+            f"{category.name!r}: scaled to {category.diagonal:g} m"
+        )
+    return category.diagonal / size

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""The visual shapes of a link as surfaces in the link's coordinates, checked and two-sided."""
+
+from __future__ import annotations
+
+import io
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from trimesh.visual import TextureVisuals
+
+from sim_assets.articulated import Visual
+from sim_assets.files import MeshResolver, SourceFiles
+from sim_assets.robot import Color, Link, Robot, Shape
+from sim_assets.sides import two_sided
+from sim_assets.solids import solid
+from sim_assets.validate import MAX_FACES, AssetError, check_mesh, refuse
+
+FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
+GREY: Color = (0.7, 0.7, 0.7, 1.0)
+
+
+def load_links(robot: Robot, files: SourceFiles) -> dict[str, tuple[Visual, ...]]:
+    """The surfaces of every link that has any, vertices in the link's coordinates (asset units).
+
+    Raises:
+        AssetError: A mesh is missing, broken, empty, outside the source folder, or all together
+            are too large.
+    """
+    cache: dict[Path, list[Visual]] = {}
+    result: dict[str, tuple[Visual, ...]] = {}
+    faces = 0
+    for link in robot.links.values():
+        visuals = _load_link(link, files, cache)
+        faces += sum(len(visual.mesh.faces) for visual in visuals)
+        if faces > MAX_FACES:
+            raise refuse(robot.path, f"at most {MAX_FACES} triangles", "more")
+        if visuals:
+            result[link.name] = visuals
+    return result
+
+
+def _load_link(
+    link: Link, files: SourceFiles, cache: dict[Path, list[Visual]]
+) -> tuple[Visual, ...]:
+    visuals: list[Visual] = []
+    for shape in link.shapes:
+        if shape.kind == "mesh":
+            path = files.locate(shape.filename)
+            if path not in cache:
+                cache[path] = load_mesh(path, files)
+            pieces = cache[path]
+        else:
+            pieces = [Visual(mesh=solid(shape.kind, shape.size), color=GREY)]
+        visuals += [_placed(piece, shape, files, f"link {link.name!r}") for piece in pieces]
+    return tuple(visuals)
+
+
+def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
+    """The pieces of a mesh file, one per material, in the file's coordinates (metres for dae).
+
+    Raises:
+        AssetError: Unknown format, unreadable, empty or broken.
+    """
+    form = path.suffix.lower().lstrip(".")
+    if form not in FORMATS:
+        raise refuse(path, f"a mesh out of {', '.join(FORMATS)}", repr(path.suffix))
+    data = files.read(path)
+    if not data.strip():
+        raise refuse(path, "a mesh", "an empty file")
+    scene = _scene(path, form, data, MeshResolver(files, path))
+    pieces = [
+        _piece(mesh)
+        for mesh in scene.dump()
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
+    ]
+    if not pieces:
+        raise refuse(path, "a mesh with triangles", "none")
+    for piece in pieces:
+        check_mesh(path, piece.mesh)
+    return _both_sides(pieces, scene)
+
+
+def _scene(path: Path, form: str, data: bytes, resolver: MeshResolver) -> trimesh.Scene:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return trimesh.load_scene(
+                io.BytesIO(data), file_type=form, resolver=resolver, process=False
+            )
+    except AssetError:
+        raise
+    except ImportError as error:
+        package = {"dae": "pycollada"}.get(form, str(error.name))
+        raise refuse(path, f"the package {package} to read it", "it is not installed") from error
+    except Exception as error:
+        raise refuse(path, f"a valid {form} file", f"{type(error).__name__}: {error}") from error
+
+
+def _piece(mesh: trimesh.Trimesh) -> Visual:
+    """A mesh with its main colour; a texture with coordinates stays on it."""
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    plain = trimesh.Trimesh(vertices, faces, process=False, validate=False)
+    visual = mesh.visual
+    if not isinstance(visual, TextureVisuals):
+        color = visual.main_color if visual is not None and visual.defined else None
+        return Visual(mesh=plain, color=_rgba(color))
+    material = visual.material
+    image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+    if image is not None and visual.uv is not None and len(visual.uv) == len(vertices):
+        plain.visual = TextureVisuals(uv=np.asarray(visual.uv, float), material=material)
+    return Visual(mesh=plain, color=_rgba(getattr(material, "main_color", None)))
+
+
+def _rgba(color: object) -> Color:
+    """0..255 in any array-like to [0, 1]."""
+    if color is None:
+        return GREY
+    values = np.asarray(color, float).reshape(-1) / 255
+    if len(values) not in (3, 4) or not np.isfinite(values).all():
+        return GREY
+    red, green, blue, alpha = np.append(values, 1.0)[:4].clip(0, 1).tolist()
+    return red, green, blue, alpha
+
+
+def _both_sides(pieces: list[Visual], scene: trimesh.Scene) -> list[Visual]:
+    """Two-sided pieces in metres; whether a shell is closed is asked of the whole file."""
+    scale = _unit(str(scene.units)) if scene.units else 1.0
+    result = []
+    offsets = np.cumsum([0, *(len(piece.mesh.vertices) for piece in pieces)])
+    stacked = np.concatenate([piece.mesh.vertices for piece in pieces])
+    joined = [piece.mesh.faces + start for piece, start in zip(pieces, offsets, strict=False)]
+    faces = two_sided(stacked, np.concatenate(joined))
+    for piece, start, end in zip(pieces, offsets[:-1], offsets[1:], strict=True):
+        mine = (faces[:, 0] >= start) & (faces[:, 0] < end)
+        if not mine.any():
+            continue
+        mesh = remade(piece.mesh, piece.mesh.vertices * scale, faces[mine] - start)
+        result.append(Visual(mesh=mesh, color=piece.color))
+    return result
+
+
+def _unit(units: str) -> float:
+    """Metres per unit: trimesh writes a dae's as "0.0254 * meters"; other formats are as URDF."""
+    found = re.match(r"^([0-9.eE+-]+) \* meters$", units)
+    return float(found[1]) if found else 1.0
+
+
+def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visual:
+    """Scaled, mirrored meshes rewound, and moved to where the shape sits on its link."""
+    vertices, faces = piece.mesh.vertices, piece.mesh.faces
+    if shape.kind == "mesh":
+        vertices = vertices * np.array(shape.size)
+        if np.prod(shape.size) < 0:
+            files.repairs.add("A mirrored mesh was wound anew", where)
+            faces = faces[:, ::-1]
+    pose = shape.link_T_shape
+    moved = vertices @ pose[:3, :3].T + pose[:3, 3]
+    return Visual(mesh=remade(piece.mesh, moved, faces), color=shape.color or piece.color)
+
+
+def remade(
+    mesh: trimesh.Trimesh, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> trimesh.Trimesh:
+    """The mesh with other positions and faces. A texture is shared: copying images is slow."""
+    result = trimesh.Trimesh(vertices, faces, process=False, validate=False)
+    if isinstance(mesh.visual, TextureVisuals):
+        result.visual = TextureVisuals(uv=mesh.visual.uv, material=mesh.visual.material)
+    return result

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: MIT
+"""Any URDF folder to an `ArticulatedObject`: find, select by split, read.
+
+    for urdf in select(find(source), "train", root=source):
+        thing = read(urdf, "oven", root=source)
+
+`read` does one model: parse and repair (`parse`), surfaces (`meshes`), the category's joints
+(`reduce`), their rest (`rest`), the object frame (`frames`), final checks (`validate`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from scapo.categories import category as find_category
+from scapo.types import Category
+from sim_assets import frames
+from sim_assets.articulated import ArticulatedObject, Origin, Visual
+from sim_assets.files import SourceFiles
+from sim_assets.frames import Vector
+from sim_assets.library import find, instance_id, select
+from sim_assets.meshes import load_links, remade
+from sim_assets.parse import parse
+from sim_assets.reduce import Reduction, Surfaces, exchanged, moved, reduce, reordered
+from sim_assets.rest import Rest, find_rest
+from sim_assets.robot import Robot
+from sim_assets.sources import Traits, traits
+from sim_assets.validate import Repairs, check_object, check_robot, refuse
+
+__all__ = ["find", "instance_id", "read", "select"]
+
+Pose = Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Resting:
+    """A model at rest, in coordinates of the root link and asset units."""
+
+    robot: Robot
+    reduction: Reduction
+    rests: tuple[Rest, ...]
+    poses: dict[str, Pose]
+    parts: tuple[tuple[Visual, ...], ...]
+    pivot: Float[np.ndarray, "J 3"]
+    axis: Float[np.ndarray, "J 3"]
+    """Positive motion opens: of the moving part as seen from the base."""
+
+    def bounds(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "P 2 3"]:
+        """Of each part, in axes turned by `rotation`."""
+        points = [self.points(part) @ rotation.T for part in range(len(self.parts))]
+        return np.stack([np.stack([p.min(0), p.max(0)]) for p in points])
+
+    def points(self, part: int) -> Float[np.ndarray, "N 3"]:
+        """Vertices that a part's triangles use."""
+        return np.concatenate([v.mesh.vertices[np.unique(v.mesh.faces)] for v in self.parts[part]])
+
+
+def read(
+    urdf: Path,
+    category: str,
+    *,
+    up: str | None = None,
+    front: str | None = None,
+    scale: float | None = None,
+    root: Path | None = None,
+) -> ArticulatedObject:
+    """Read one model as an object of a category.
+
+    Args:
+        urdf: The file.
+        category: Name of one of `scapo.categories.CATEGORIES`.
+        up: Which axis of the URDF's root link is up, such as "z" or "-y"; by the source if None.
+        front: Which axis the front faces; by the source, else told from the joint, if None.
+        scale: Metres per unit of the URDF; by the source if None.
+        root: The source folder: no file outside of it is opened, instance ids are relative to it.
+            By default the model's own folder, or package.
+
+    Returns:
+        The object, in the object frame at rest.
+
+    Raises:
+        AssetError: The model cannot be used; the message says why.
+        ValueError: No such category.
+    """
+    spec = find_category(category)
+    repairs = Repairs()
+    root = package_root(urdf) if root is None else root
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise refuse(urdf, "a scale above zero", f"{scale}")
+    robot = parse(urdf, repairs)
+    check_robot(urdf, robot)
+    known = traits(robot)
+    files = SourceFiles(urdf=urdf, root=root, repairs=repairs)
+    for file in (urdf, *known.files):
+        files.read(file)
+    surfaces = load_links(robot, files)
+    upward = frames.direction(up or known.up, urdf)
+    reduction = reduce(robot, surfaces, spec, known)
+    rests = find_rest(robot, surfaces, reduction, spec, upward)
+    resting = _resting(robot, surfaces, reduction, rests)
+    rotation = _rotation(resting, spec, known, (up, front), repairs)
+    resting = _ordered(resting, surfaces, spec, rotation)
+    bounds = resting.bounds(rotation)
+    low, high = bounds[:, 0].min(0), bounds[:, 1].max(0)
+    size = float(np.linalg.norm(high - low))
+    ratio = frames.metres_per_unit(spec, size, known.metric, scale, repairs)
+    similarity = np.eye(4)
+    similarity[:3, :3] = ratio * rotation
+    similarity[:3, 3] = -ratio * (low + high) / 2
+    thing = _object(resting, spec, similarity, files, instance_id(urdf, root))
+    check_object(urdf, thing)
+    return thing
+
+
+def package_root(urdf: Path) -> Path:
+    """The folder that holds all files of a model when the caller names none.
+
+    That of the URDF; above a folder `urdf` or `robots`, the package, and for `package://` names
+    its parent.
+    """
+    folder = urdf.resolve().parent
+    return folder.parent.parent if folder.name in ("urdf", "urdfs", "robots") else folder
+
+
+def _resting(
+    robot: Robot, surfaces: Surfaces, reduction: Reduction, rests: tuple[Rest, ...]
+) -> _Resting:
+    names = [joint.name for joint in reduction.joints]
+    poses = robot.poses({n: r.position for n, r in zip(names, rests, strict=True)})
+    rows = zip(reduction.joints, rests, reduction.inverted, strict=True)
+    axes = [
+        poses[joint.child][:3, :3] @ joint.axis * rest.direction * (-1.0 if inverted else 1.0)
+        for joint, rest, inverted in rows
+    ]
+    parts = tuple(
+        tuple(
+            _moved(visual, poses[name])
+            for name in robot.links
+            if name in part
+            for visual in surfaces.get(name, ())
+        )
+        for part in reduction.parts
+    )
+    return _Resting(
+        robot=robot,
+        reduction=reduction,
+        rests=rests,
+        poses=poses,
+        parts=parts,
+        pivot=np.stack([poses[joint.child][:3, 3] for joint in reduction.joints]),
+        axis=np.stack(axes),
+    )
+
+
+def _rotation(
+    resting: _Resting,
+    category: Category,
+    known: Traits,
+    wanted: tuple[str | None, str | None],
+    repairs: Repairs,
+) -> Float[np.ndarray, "3 3"]:
+    """object_R_asset: by the caller, then the source, then the joint."""
+    path = resting.robot.path
+    upward = frames.direction(wanted[0] or known.up, path)
+    given = wanted[1] or (known.front if wanted[0] is None else None)
+    if category.name == "scissors":
+        return _along_blades(resting, upward, wanted[1])
+    if given is not None:
+        return frames.basis(upward, frames.direction(given, path), path)
+    middle = resting.bounds(np.eye(3))[1:].mean(1)
+    front = frames.infer_front(category, upward, resting.pivot, resting.axis, middle)
+    repairs.add(f"The front was told from the joint: {frames.name_of(front)}")
+    return frames.basis(upward, front, path)
+
+
+def _along_blades(resting: _Resting, upward: Vector, front: str | None) -> Float[np.ndarray, "3 3"]:
+    """Scissors: z along the axis towards up, x along the closed blades, tips towards +x."""
+    normal = resting.axis[0]
+    if normal @ upward < -1e-6:
+        normal = -normal
+    points = np.concatenate([resting.points(0), resting.points(1)])
+    along = frames.long_axis(points, normal)
+    if front is not None:
+        wanted = frames.direction(front, resting.robot.path)
+        along = -along if along @ wanted > 0 else along
+        return np.stack([along, np.cross(normal, along), normal])
+    rotation = np.stack([along, np.cross(normal, along), normal])
+    local = (points - resting.pivot[0]) @ rotation.T
+    widths = [np.abs(local[side, 1]).mean() for side in (local[:, 0] < 0, local[:, 0] > 0)]
+    turn = np.diag([-1.0, -1.0, 1.0]) if widths[1] > widths[0] else np.eye(3)
+    return turn @ rotation
+
+
+def _ordered(
+    resting: _Resting, surfaces: Surfaces, category: Category, rotation: Float[np.ndarray, "3 3"]
+) -> _Resting:
+    """Left before right (left is -y); the scissors blade from which the other opens about +z."""
+    robot, reduction, rests = resting.robot, resting.reduction, resting.rests
+    if len(rests) == 2:
+        middle = resting.bounds(rotation).mean(1)
+        if middle[1, 1] > middle[2, 1]:
+            return _resting(robot, surfaces, reordered(reduction), rests[::-1])
+    elif category.name == "scissors" and (rotation @ resting.axis[0])[2] < 0:
+        return _resting(robot, surfaces, exchanged(reduction), rests)
+    return resting
+
+
+def _object(
+    resting: _Resting, category: Category, object_T_asset: Pose, files: SourceFiles, name: str
+) -> ArticulatedObject:
+    ratio = float(np.cbrt(np.linalg.det(object_T_asset[:3, :3])))
+    rotation = object_T_asset[:3, :3] / ratio
+    visuals = tuple(
+        _merged([_moved(visual, object_T_asset) for visual in part]) for part in resting.parts
+    )
+    pivot = moved(resting.pivot, object_T_asset)
+    upper = np.array([rest.upper for rest in resting.rests])
+    for j, spec in enumerate(category.joints):
+        if spec.kind == "prismatic":
+            bounds = np.concatenate([visual.mesh.bounds for visual in visuals[j + 1]])
+            pivot[j] = (bounds.min(0) + bounds.max(0)) / 2
+            upper[j] = min(upper[j] * ratio, spec.upper)
+    joints = resting.reduction.joints
+    at = {joint.name: rest.position for joint, rest in zip(joints, resting.rests, strict=True)}
+    axis = resting.axis @ rotation.T
+    return ArticulatedObject(
+        category=category,
+        instance=name,
+        visuals=visuals,
+        pivot=pivot,
+        axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        upper=upper,
+        origin=Origin(
+            source=files.urdf.resolve().relative_to(files.root.resolve()).as_posix(),
+            sha256=files.digest(),
+            object_T_asset=object_T_asset,
+            rest={name: float(q) for name, q in resting.robot.positions(at).items()},
+            joint_names=tuple(joint.name for joint in joints),
+            sign=tuple(rest.direction for rest in resting.rests),
+            repairs=files.repairs.sentences(),
+        ),
+    )
+
+
+def _moved(visual: Visual, a_T_b: Pose) -> Visual:
+    vertices = moved(np.asarray(visual.mesh.vertices), a_T_b)
+    return Visual(mesh=remade(visual.mesh, vertices, visual.mesh.faces), color=visual.color)
+
+
+def _merged(visuals: list[Visual]) -> tuple[Visual, ...]:
+    """Untextured surfaces of one colour as one: renderers pay for each."""
+    groups: dict[object, list[Visual]] = {}
+    for k, visual in enumerate(visuals):
+        textured = visual.mesh.visual.kind == "texture"
+        groups.setdefault(k if textured else visual.color, []).append(visual)
+    return tuple(_joined(group) for group in groups.values())
+
+
+def _joined(visuals: list[Visual]) -> Visual:
+    if len(visuals) == 1:
+        return visuals[0]
+    meshes = [visual.mesh for visual in visuals]
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)]
+    vertices = np.concatenate([mesh.vertices for mesh in meshes])
+    mesh = trimesh.Trimesh(vertices, np.concatenate(faces), process=False, validate=False)
+    return Visual(mesh=mesh, color=visuals[0].color)

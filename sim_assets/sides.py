@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+"""Surfaces that look the same from both sides, for renderers that draw front faces only.
+
+SAPIEN culls back faces: a panel seen from behind gives no depth, a mirrored mesh shows its inside.
+Closed shells with one winding stay (turned outward where needed); every other face gets its
+reverse beside it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+def two_sided(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Int[np.ndarray, "G 3"]:
+    """Faces over the same vertices of which each point of the surface has one towards any viewer.
+
+    Faces without area are left out. Vertices at the same place count as one.
+
+    Args:
+        vertices: Any unit.
+        faces: Vertex indices.
+
+    Returns:
+        The faces kept, outward ones of closed shells first turned, then the reverses added.
+    """
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces = faces[np.abs(cross).max(1) > 0]
+    welded = _weld(vertices)[faces]
+    distinct = (welded != np.roll(welded, 1, axis=1)).all(1)
+    faces, welded = faces[distinct], welded[distinct]
+    shell, closed = _shells(welded)
+    volumes = np.einsum("ij,ij->i", vertices[faces[:, 0]], np.cross(*_sides(vertices, faces)))
+    volume = np.bincount(shell, volumes)
+    inward = (closed & (volume < 0))[shell]
+    faces = np.where(inward[:, None], faces[:, ::-1], faces)
+    reverse = _without_reverse(welded) & ~closed[shell]
+    return np.concatenate([faces, faces[reverse][:, ::-1]])
+
+
+def _sides(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]:
+    return vertices[faces[:, 1]], vertices[faces[:, 2]]
+
+
+def _weld(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
+    """One number per place: vertices that agree to a millionth of the size are one."""
+    size = float(np.ptp(vertices, axis=0).max()) or 1.0
+    places = np.round(vertices / (size * 1e-6)).astype(np.int64)
+    return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _shells(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, " F"], Bool[np.ndarray, " S"]]:
+    """The shell of each face, joined over shared edges, and whether each shell is closed.
+
+    Closed: every edge is run through exactly once in each direction.
+    """
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    owner = np.repeat(np.arange(len(faces)), 3)
+    many = int(faces.max()) + 1 if len(faces) else 1
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    _, edge, uses = np.unique(low * many + high, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1)
+    links = coo_array(
+        (np.ones(len(edge)), (owner, len(faces) + edge)), shape=(len(faces) + len(uses),) * 2
+    )
+    count, label = connected_components(links, directed=False)
+    shell = label[: len(faces)]
+    forward = np.bincount(edge, start < end, minlength=len(uses))
+    good = (uses == 2) & (forward == 1)
+    broken = np.bincount(shell[owner], ~good[edge], minlength=count)
+    return shell, broken == 0
+
+
+def _without_reverse(faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    """Faces whose mirror twin (the same corners run the other way) is not in the mesh."""
+    if len(faces) == 0:
+        return np.zeros(0, bool)
+    turn = faces.argmin(1)
+    first = np.take_along_axis(faces, turn[:, None], 1)
+    second = np.take_along_axis(faces, (turn[:, None] + 1) % 3, 1)
+    third = np.take_along_axis(faces, (turn[:, None] + 2) % 3, 1)
+    forward = np.concatenate([first, second, third], 1)
+    backward = np.concatenate([first, third, second], 1)
+    both = np.concatenate([forward, backward])
+    group = np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)
+    return ~np.isin(group[len(faces) :], group[: len(faces)])
