@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.procedural import drawer, laptop, oven
+from sim_assets.procedural import drawer, eyeglasses, laptop, oven
 from sim_assets.procedural.assembly import VERSION, Design, assemble, digest
 from sim_assets.procedural.parameters import HeldOut, draw
 
@@ -45,6 +45,12 @@ RECIPES: dict[str, Recipe] = {
     ),
     "oven": Recipe(shape=oven.OvenShape, build=oven.build, held_out=oven.HELD_OUT),
     "drawer": Recipe(shape=drawer.DrawerShape, build=drawer.build, held_out=drawer.HELD_OUT),
+    "eyeglasses": Recipe(
+        shape=eyeglasses.EyeglassesShape,
+        build=eyeglasses.build,
+        held_out=eyeglasses.HELD_OUT,
+        symmetric=eyeglasses.SYMMETRIC,
+    ),
 }
 
 
