@@ -18,7 +18,7 @@ from jaxtyping import Float, Int, UInt8
 from scapo.camera import Intrinsics
 from scapo.points import farthest_points
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.renderer import BACKGROUND, Frame
+from sim_assets.renderer import BACKGROUND, Frame, face_colors
 from sim_assets.views import generator
 
 Sampling = Literal["random", "fps"]
@@ -151,6 +151,7 @@ class Surface:
         self.points = np.stack([points for points, _ in drawn])  # (P, K, 3)
         self.normals = np.stack([mesh.face_normals[face] for mesh, (_, face) in
                                  zip(self.meshes, drawn, strict=True)])
+        self.colors = [face_colors(visuals) for visuals in thing.visuals]
         self.areas = np.array([mesh.area for mesh in self.meshes])
         self.tolerance = TOLERANCE * float(np.linalg.norm(thing.extents()))
 
@@ -198,22 +199,32 @@ class Surface:
         self,
         camera_T_part: Float[np.ndarray, "P 4 4"],
         count: int,
+        least: int,
         rng: np.random.Generator,
         sampling: Sampling = "random",
     ) -> Cloud:
-        """`count` points of the whole posed surface (`--protocol full`), uniform by area."""
+        """`count` points of the whole posed surface (`--protocol full`), uniform by area.
+
+        A part that would get fewer than `least` points gets that many.
+        """
         dense = 4 * count if sampling == "fps" else count
-        part = rng.choice(len(self.meshes), dense, p=self.areas / self.areas.sum())
-        points = np.zeros((dense, 3))
-        for p, pose in enumerate(camera_T_part):
-            mine = part == p
-            drawn, _ = sample_surface(self.meshes[p], int(mine.sum()), rng)
-            points[mine] = drawn @ pose[:3, :3].T + pose[:3, 3]
-        chosen = choose_far(points, count, rng) if sampling == "fps" else np.arange(count)
+        share = np.maximum(self.areas / self.areas.sum(), 1.5 * least / count)
+        number = np.maximum(rng.multinomial(dense, share / share.sum()), least)
+        number[number.argmax()] += dense - number.sum()
+        points, colors = [], []
+        for mesh, pose, table, n in zip(
+            self.meshes, camera_T_part, self.colors, number, strict=True
+        ):
+            drawn, face = sample_surface(mesh, int(n), rng)
+            points.append(drawn @ pose[:3, :3].T + pose[:3, 3])
+            colors.append(table[face])
+        part = np.repeat(np.arange(len(number), dtype=np.uint8), number)
+        every = np.concatenate(points)
+        chosen = choose_far(every, count, rng) if sampling == "fps" else rng.permutation(count)
         return Cloud(
-            points=points[chosen].astype(np.float32),
-            part=part[chosen].astype(np.uint8),
-            color=None,
+            points=every[chosen].astype(np.float32),
+            part=part[chosen],
+            color=np.concatenate(colors)[chosen],
         )
 
 

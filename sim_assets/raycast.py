@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.renderer import BACKGROUND, AbstractRenderer, Frame, RenderError
+from sim_assets.renderer import BACKGROUND, AbstractRenderer, Frame, RenderError, face_colors
 
 REBUILD_BELOW = 12_000
 """Triangles up to which an object is merged and rebuilt for each view."""
@@ -36,7 +36,7 @@ class RaycastRenderer(AbstractRenderer):
         meshes = [thing.part_mesh(part) for part in range(len(thing.visuals))]
         self.vertices = [np.asarray(mesh.vertices, np.float64) for mesh in meshes]
         self.faces = [np.asarray(mesh.faces, np.int32) for mesh in meshes]
-        self.colors = [_face_colors(thing, part) for part in range(len(meshes))]
+        self.colors = [face_colors(thing.visuals[part]) for part in range(len(meshes))]
         self.large = sum(len(faces) for faces in self.faces) > REBUILD_BELOW
         self.scenes = [
             _embree(vertices, faces) if self.large else None
@@ -178,11 +178,3 @@ def _rays(
         top, bottom = np.clip([np.floor(v.min()) - 1, np.ceil(v.max()) + 1], 0, height).astype(int)
     index = np.arange(height * width).reshape(height, width)[top:bottom, left:right]
     return index.ravel(), rays[top:bottom, left:right].reshape(-1, 3)
-
-
-def _face_colors(thing: ArticulatedObject, part: int) -> np.ndarray:
-    rows = [
-        np.repeat([visual.color[:3]], len(visual.mesh.faces), axis=0)
-        for visual in thing.visuals[part]
-    ]
-    return np.clip(np.concatenate(rows) * 255 + 0.5, 0, 255).astype(np.uint8)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from scapo.camera import Intrinsics
-from sim_assets.articulated import ArticulatedObject
+from sim_assets.articulated import ArticulatedObject, Visual
 
 Backend = Literal["sapien", "raycast"]
 BACKGROUND = 255
@@ -128,3 +128,9 @@ _CHECK: dict[str, Callable[[], str | None]] = {
     "sapien": _sapien_missing,
     "raycast": _raycast_missing,
 }
+
+
+def face_colors(visuals: tuple[Visual, ...]) -> UInt8[np.ndarray, "F 3"]:
+    """sRGB colour of each face of a part, in the order of `ArticulatedObject.part_mesh`."""
+    rows = [np.tile(visual.color[:3], (len(visual.mesh.faces), 1)) for visual in visuals]
+    return np.clip(np.concatenate(rows) * 255 + 0.5, 0, 255).astype(np.uint8)

@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: MIT
+"""Run pure jobs in worker processes: a job that fails, dies or hangs costs that job only.
+
+A job is any picklable value; the function that does it is a module-level function
+`function(job, report)`, which calls `report(label, amount)` as a sign of life: what it is about to
+do, and how much it has done since the last call. Workers are spawned, with one numerical thread
+each, and end by themselves when the parent is gone.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from typing import Any, Generic, Literal, TypeVar
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+Report = Callable[[str, int], None]
+
+ONE_THREAD = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "LP_NUM_THREADS",
+)
+"""Thread counts set to 1 in workers: of BLAS and OpenMP, and of Mesa's CPU renderer."""
+TICK = 0.5
+"""Seconds between looks at the clock."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome(Generic[Job, Result]):
+    """How a job ended: with a result, or with a reason."""
+
+    job: Job
+    result: Result | None
+    failure: Literal["error", "died", "hung"] | None = None
+    reason: str = ""
+    label: str = ""
+    """What the job reported last."""
+
+
+@dataclass(slots=True, kw_only=True)
+class _Worker:
+    process: Any
+    pipe: Connection
+    job: Any = None
+    busy: bool = False
+    label: str = ""
+    heard: float = 0.0
+
+
+class Pool(Generic[Job, Result]):
+    """Worker processes, as a context manager; leaving it ends them.
+
+    Args of the constructor: `workers` >= 1 processes; `timeout` seconds without a sign of life
+    after which a job counts as hung and its worker is killed.
+    """
+
+    def __init__(self, workers: int, *, timeout: float = 300.0) -> None:
+        if workers < 1:
+            raise ValueError(f"workers: expected 1 or more, found {workers}")
+        self.size = workers
+        self.timeout = timeout
+        self._workers: list[_Worker] = []
+
+    def __enter__(self) -> Pool[Job, Result]:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for worker in self._workers:
+            _end(worker)
+        self._workers = []
+
+    def run(
+        self,
+        function: Callable[[Job, Report], Result],
+        jobs: Iterable[Job],
+        on_report: Callable[[Job, str, int], None] | None = None,
+    ) -> Iterator[Outcome[Job, Result]]:
+        """Do the jobs; outcomes come in the order in which they end.
+
+        Args:
+            function: Module-level, does one job.
+            jobs: Handed out in order.
+            on_report: Called in this process with the job and each of its reports.
+        """
+        waiting = deque(jobs)
+        while waiting or any(worker.busy for worker in self._workers):
+            self._hand_out(function, waiting)
+            ready = wait([worker.pipe for worker in self._workers if worker.busy], TICK)
+            for worker in [w for w in self._workers if w.busy]:
+                outcome = self._listen(worker, worker.pipe in ready, on_report)
+                if outcome is not None:
+                    worker.busy = False
+                    yield outcome
+
+    def _hand_out(self, function: Callable[..., Any], waiting: deque[Any]) -> None:
+        idle = [worker for worker in self._workers if not worker.busy]
+        while waiting and (idle or len(self._workers) < self.size):
+            worker = idle.pop() if idle else self._start()
+            try:
+                worker.pipe.send((function, waiting[0]))
+            except (BrokenPipeError, ConnectionResetError):  # it died while idle
+                self._drop(worker)
+                continue
+            worker.job, worker.label = waiting.popleft(), ""
+            worker.busy, worker.heard = True, time.monotonic()
+
+    def _start(self) -> _Worker:
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs,), daemon=True)
+        with _environment(dict.fromkeys(ONE_THREAD, "1")):
+            process.start()
+        theirs.close()
+        worker = _Worker(process=process, pipe=ours)
+        self._workers.append(worker)
+        return worker
+
+    def _listen(
+        self,
+        worker: _Worker,
+        ready: bool,
+        on_report: Callable[[Job, str, int], None] | None,
+    ) -> Outcome[Job, Result] | None:
+        """The outcome of the worker's job if it has ended."""
+        try:
+            while ready and worker.pipe.poll():
+                kind, *content = worker.pipe.recv()
+                worker.heard = time.monotonic()
+                if kind == "report":
+                    worker.label = content[0]
+                    if on_report is not None:
+                        on_report(worker.job, *content)
+                else:
+                    result, reason = content
+                    return _outcome(worker, result, "error" if kind == "error" else None, reason)
+        except (EOFError, ConnectionResetError):
+            worker.process.join(timeout=5)  # so that its exit code is known
+            self._drop(worker)
+            return _outcome(worker, None, "died", _cause(worker.process.exitcode))
+        if time.monotonic() - worker.heard > self.timeout:
+            self._drop(worker)
+            reason = f"no sign of life for {self.timeout:g} s"
+            return _outcome(worker, None, "hung", reason)
+        return None
+
+    def _drop(self, worker: _Worker) -> None:
+        self._workers.remove(worker)
+        _end(worker)
+
+
+def _outcome(
+    worker: _Worker, result: Any, failure: Literal["error", "died", "hung"] | None, reason: str
+) -> Outcome[Any, Any]:
+    return Outcome(
+        job=worker.job, result=result, failure=failure, reason=reason, label=worker.label
+    )
+
+
+def _end(worker: _Worker) -> None:
+    worker.pipe.close()  # an idle worker ends at once
+    worker.process.join(timeout=0 if worker.busy else 2)
+    if worker.process.is_alive():
+        worker.process.kill()
+        worker.process.join()
+
+
+def _cause(exit_code: int | None) -> str:
+    if exit_code is not None and exit_code < 0:
+        with suppress(ValueError):
+            return f"its process was ended by {signal.Signals(-exit_code).name}"
+    return f"its process ended with exit code {exit_code}"
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for a process that is started here, and put them back."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _work(pipe: Connection) -> None:
+    """A worker: do what comes through the pipe until it closes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+
+    def report(label: str, amount: int = 0) -> None:
+        pipe.send(("report", label, amount))
+
+    with suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the parent is gone
+        while True:
+            function, job = pipe.recv()
+            try:
+                message = ("result", function(job, report), "")
+            except (BrokenPipeError, ConnectionResetError):
+                raise
+            except Exception as error:  # noqa: BLE001 - whatever it is, it costs this job only
+                message = ("error", None, describe_error(error))
+            pipe.send(message)
+
+
+def describe_error(error: BaseException) -> str:
+    """One line: the message of an error meant for users, else its type and message."""
+    text = " ".join(str(error).split())
+    if isinstance(error, (ValueError, OSError, RuntimeError)) and text:
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

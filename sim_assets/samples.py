@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: MIT
+"""Labelled samples of one object: views are drawn, rendered, checked, and drawn again if poor."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from scapo.camera import Intrinsics
+from sim_assets.articulated import ArticulatedObject
+from sim_assets.cloud import Cloud, Sampling, Surface, count_visible, sample_frames, truth
+from sim_assets.renderer import AbstractRenderer, Backend, Frame
+from sim_assets.views import Outline, View, draw_views, generator
+
+Protocol = Literal["joint", "isolated", "full"]
+Row = dict[str, np.ndarray]
+"""One sample: the tensors of CONTRACT 3 without their first dimension."""
+
+LEAST_PIXELS = 200
+"""Visible pixels below which a view is drawn again (CONTRACT 3)."""
+LEAST_POINTS = 16
+"""Points of each part below which a view is drawn again (CONTRACT 4)."""
+MAX_DRAWS = 100
+"""Draws of one view after which an object counts as impossible to show."""
+BATCH = 64
+"""Views that are framed together."""
+
+
+class ViewError(ValueError):
+    """An object cannot be shown as asked: `instance: expected, found`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How objects are turned into samples: all that changes pixels but the objects."""
+
+    protocol: Protocol
+    """joint: the whole object in one picture. isolated: a picture of each part alone, merged.
+    full: points of the whole surface."""
+    backend: Backend
+    camera: Intrinsics
+    points: int
+    sampling: Sampling
+    color: bool
+    states_per_view: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shot:
+    """What became of one view."""
+
+    rows: list[Row]
+    """One per state."""
+    draws: int
+    """1 if the first draw was good."""
+    plan: bytes
+    """States and camera of the first draw in whole 1e-6: the same on every machine."""
+
+
+class Shooter:
+    """Makes samples of one object with an open renderer."""
+
+    def __init__(
+        self, renderer: AbstractRenderer, thing: ArticulatedObject, settings: Settings
+    ) -> None:
+        """Open the object in the renderer (not for `full`, which needs no picture)."""
+        self.renderer, self.thing, self.settings = renderer, thing, settings
+        self.outline = Outline(thing)
+        self.surface = Surface(thing)
+        self.least = min(LEAST_POINTS, max(1, settings.points // (4 * len(thing.visuals))))
+        if settings.protocol != "full":
+            renderer.open(thing)
+
+    def shots(self, keys: Sequence[tuple[object, ...]]) -> Iterator[Shot]:
+        """One shot per key, in order; a shot is a function of object, settings and its key.
+
+        Raises:
+            ViewError: No draw of a view was good.
+        """
+        settings = self.settings
+        for start in range(0, len(keys), BATCH):
+            batch = keys[start : start + BATCH]
+            rngs = [generator(*key, 0) for key in batch]
+            views = draw_views(self.outline, rngs, settings.camera, settings.states_per_view)
+            for key, rng, view in zip(batch, rngs, views, strict=True):
+                yield self._shoot(key, rng, view)
+
+    def _shoot(self, key: tuple[object, ...], rng: np.random.Generator, view: View) -> Shot:
+        plan = _plan_bytes(view)
+        for draws in range(1, MAX_DRAWS + 1):
+            if draws > 1:
+                rng = generator(*key, draws - 1)
+                camera, states = self.settings.camera, self.settings.states_per_view
+                (view,) = draw_views(self.outline, [rng], camera, states)
+            rows = self._rows(view, rng)
+            if rows is not None:
+                return Shot(rows=rows, draws=draws, plan=plan)
+        raise ViewError(
+            f"{self.thing.instance}: expected a view with {LEAST_PIXELS} visible pixels and "
+            f"{self.least} of {self.settings.points} points on each part, found none in "
+            f"{MAX_DRAWS} draws"
+        )
+
+    def _rows(self, view: View, rng: np.random.Generator) -> list[Row] | None:
+        """Samples of all states, or None if one of them shows too little."""
+        rows = []
+        for state in view.states:
+            row = self._row(state, view, rng)
+            if row is None:
+                return None
+            rows.append(row)
+        return rows
+
+    def _row(self, state: np.ndarray, view: View, rng: np.random.Generator) -> Row | None:
+        settings = self.settings
+        known = truth(self.thing, state, view.camera_T_object)
+        if settings.protocol == "full":
+            visible = np.ones(len(known.camera_T_part))
+            cloud = self.surface.sample(
+                known.camera_T_part, settings.points, self.least, rng, settings.sampling
+            )
+        else:
+            frames = self._frames(state, view)
+            if count_visible(frames) < LEAST_PIXELS:
+                return None
+            cloud = sample_frames(frames, settings.camera, settings.points, rng, settings.sampling)
+            visible = self.surface.visible(frames, settings.camera, known.camera_T_part)
+        per_part = np.bincount(cloud.part, minlength=len(known.camera_T_part))
+        if per_part.min() < self.least:
+            return None
+        return {
+            **_cloud_row(cloud, settings.color),
+            "camera_T_part": known.camera_T_part.astype(np.float32),
+            "joint_pivot": known.pivot.astype(np.float32),
+            "joint_axis": known.axis.astype(np.float32),
+            "joint_state": known.state.astype(np.float32),
+            "visible": visible.astype(np.float32),
+            "camera": np.array(settings.camera.row(), np.float32),
+        }
+
+    def _frames(self, state: np.ndarray, view: View) -> list[Frame]:
+        camera = self.settings.camera
+        if self.settings.protocol == "joint":
+            return [self.renderer.render(state, view.camera_T_object, camera)]
+        parts = range(len(self.thing.visuals))
+        return [self.renderer.render(state, view.camera_T_object, camera, part) for part in parts]
+
+
+def _cloud_row(cloud: Cloud, color: bool) -> Row:
+    row = {"points": cloud.points, "part": cloud.part}
+    if color and cloud.color is not None:
+        row["color"] = cloud.color
+    return row
+
+
+def _plan_bytes(view: View) -> bytes:
+    numbers = np.concatenate([view.states.ravel(), view.camera_T_object[:3].ravel()])
+    return np.rint(numbers * 1e6).astype("<i8").tobytes()
+
+
+def geometry_digest(thing: ArticulatedObject) -> str:
+    """SHA-256 of an object's surfaces and joints in whole 1e-6 m and rad."""
+    digest = hashlib.sha256()
+    for part in range(len(thing.visuals)):
+        mesh = thing.part_mesh(part)
+        digest.update(np.rint(np.asarray(mesh.vertices) * 1e6).astype("<i8").tobytes())
+        digest.update(np.asarray(mesh.faces).astype("<i8").tobytes())
+    for numbers in (thing.pivot, thing.axis, thing.upper):
+        digest.update(np.rint(numbers * 1e6).astype("<i8").tobytes())
+    return digest.hexdigest()

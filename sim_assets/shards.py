@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""The jobs that workers do: describe an object, and render a shard to its file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scapo.jobs import Report, describe_error
+from scapo.store import SAMPLES, read_header, write
+from sim_assets.assets import Asset
+from sim_assets.plan import Entry, Piece, Request, ShardPlan, instance_record
+from sim_assets.renderer import AbstractRenderer, Backend, make_renderer
+from sim_assets.samples import Row, Shooter, Shot, geometry_digest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardJob:
+    """Render one shard into a folder."""
+
+    folder: Path
+    request: Request
+    plan: ShardPlan
+    options: dict[str, Any]
+    versions: dict[str, str]
+    strict: bool
+    """Fail at the first object that fails."""
+    skip: Mapping[str, str] = field(default_factory=dict)
+    """Instance -> reason: objects that killed or hung a worker before."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardDone:
+    """What became of a shard; all but `sha256` is in its header too."""
+
+    file: str
+    count: int
+    sha256: str
+    plan: str
+    """SHA-256 of the views' first-drawn states and cameras."""
+    views: int
+    draws: int
+    failed: dict[str, str]
+    """Instance -> reason, of objects that gave no samples."""
+
+
+def describe(asset: Asset, report: Report) -> Entry:
+    """Load an object once and record what the manifest says of it."""
+    report(asset.name, 0)
+    thing = asset.load()
+    return Entry(asset=asset, instance=instance_record(thing), geometry=geometry_digest(thing))
+
+
+def render_shard(job: ShardJob, report: Report) -> ShardDone:
+    """Render the shard's objects one after the other and write the file.
+
+    An object that fails is left out with its reason, unless `strict`.
+    """
+    rows: list[Row] = []
+    shots: list[Shot] = []
+    failed: dict[str, str] = {}
+    for piece in job.plan.pieces:
+        name = piece.entry.instance.id
+        try:
+            if name in job.skip:
+                raise RuntimeError(job.skip[name])
+            taken, made = render_piece(job.request, piece, report)
+        except Exception as error:
+            if job.strict:
+                raise
+            failed[name] = describe_error(error)
+            report(name, piece.views * job.request.settings.states_per_view)
+            continue
+        shots += taken
+        rows += made
+    return _write(job, rows, shots, failed)
+
+
+def render_piece(request: Request, piece: Piece, report: Report) -> tuple[list[Shot], list[Row]]:
+    """Samples of one object, with the instance index added.
+
+    Raises:
+        ValueError: The object is no longer the one that was planned.
+        ViewError: It cannot be shown as asked.
+        RenderError: The renderer failed.
+    """
+    name = piece.entry.instance.id
+    report(name, 0)
+    thing = piece.entry.asset.load()
+    if thing.origin.sha256 != piece.entry.instance.sha256:
+        raise ValueError(
+            f"{name}: expected files with sha256 {piece.entry.instance.sha256}, found "
+            f"{thing.origin.sha256}: they have changed since this data set was begun"
+        )
+    settings = request.settings
+    shooter = Shooter(_renderer(settings.backend, settings.color), thing, settings)
+    keys = [request.key(view) for view in range(piece.first, piece.first + piece.views)]
+    shots = []
+    for shot in shooter.shots(keys):
+        shots.append(shot)
+        report(name, settings.states_per_view)
+    index = np.array(piece.index, np.int32)
+    return shots, [{**row, "instance": index} for shot in shots for row in shot.rows]
+
+
+@lru_cache(maxsize=1)
+def _renderer(backend: Backend, color: bool) -> AbstractRenderer:
+    return make_renderer(backend, color=color)
+
+
+def _write(
+    job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, str]
+) -> ShardDone:
+    digest = hashlib.sha256(b"".join(shot.plan for shot in shots)).hexdigest()
+    done = {
+        "count": len(rows),
+        "plan": digest,
+        "views": len(shots),
+        "draws": sum(shot.draws for shot in shots),
+        "failed": failed,
+    }
+    header = {
+        "format": SAMPLES,
+        "category": job.request.category,
+        "split": job.request.split,
+        "seed": job.request.seed,
+        "first": job.plan.first,
+        "options": job.options,
+        "versions": job.versions,
+        **done,
+    }
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} if rows else {}
+    sha256 = write(job.folder / job.plan.file, arrays, header)
+    return ShardDone(file=job.plan.file, sha256=sha256, **done)
+
+
+def read_done(path: Path, sha256: str) -> ShardDone:
+    """What a finished shard says of itself; `sha256` is that of its bytes."""
+    header = read_header(path, SAMPLES)
+    names = ("count", "plan", "views", "draws", "failed")
+    return ShardDone(file=path.name, sha256=sha256, **{name: header[name] for name in names})
