@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import safe_open
+from jaxtyping import Int
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from scapo.store import Split, StoreError, check_shape, open_split, read_header
+from scapo.layout import UNLABELLED, StoreError, check_samples
+from scapo.store import SAMPLES, Split, open_split, read_header, require
 from scapo.types import Joints, Labels, Observation
-
-UNLABELLED = 255
-"""Part index of background and unlabelled points on disk; -1 in memory."""
 
 TENSORS = (
     "points",
@@ -58,23 +57,27 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
 
     def __getitem__(self, index: int) -> dict[str, Tensor]:
         """Sample `index`; negative counts from the end."""
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"sample {index}: expected less than {len(self)}")
-        return self.__getitems__([index % len(self)])[0]
+        return self.__getitems__([index])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Tensor]]:
         """Several samples: the call that DataLoader makes for a batch."""
-        batch = self.batch(torch.as_tensor(indices))
+        batch = self.batch(torch.as_tensor(indices, dtype=torch.long))
         return [{name: tensor[i] for name, tensor in batch.items()} for i in range(len(indices))]
 
-    def batch(self, indices: Tensor) -> dict[str, Tensor]:
-        """The samples of `indices` (K,) stacked, in that order."""
-        shard_of = np.searchsorted(self._ends, indices.numpy(), side="right")
+    def batch(self, indices: Int[Tensor, " K"]) -> dict[str, Tensor]:
+        """The samples of `indices` stacked, in that order; negative ones count from the end.
+
+        Raises:
+            IndexError: There is no such sample.
+            StoreError: A shard is not what the manifest and CONTRACT 3 say.
+        """
+        index = self._inside(indices)
+        shard_of = np.searchsorted(self._ends, index, side="right")
         order = np.argsort(shard_of, kind="stable")
         pieces: dict[str, list[Tensor]] = {name: [] for name in self.names}
-        for shard in np.unique(shard_of):
-            first = self.split.manifest.shards[shard].first
-            local = indices[torch.from_numpy(order[shard_of[order] == shard])] - first
+        for shard in np.unique(shard_of) if len(index) else [0]:
+            rows = order[shard_of[order] == shard]
+            local = torch.from_numpy(index[rows] - self.split.manifest.shards[shard].first)
             for name, tensor in self._shard(int(shard)).items():
                 pieces[name].append(tensor[local])
         back = torch.from_numpy(np.argsort(order))
@@ -82,23 +85,33 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         if "part" in out:
             part = out["part"].long()
             out["part"] = torch.where(part == UNLABELLED, -1, part)
-        out["index"] = indices.clone()
+        out["index"] = torch.from_numpy(index)
         return out
 
+    def _inside(self, indices: Tensor) -> np.ndarray:
+        """The indices from 0 on."""
+        index = indices.cpu().numpy().astype(np.int64)
+        outside = index[(index < -len(self)) | (index >= len(self))]
+        if outside.size:
+            raise IndexError(
+                f"{self.split.folder}: expected a sample below {len(self)}, found {outside[0]}"
+            )
+        return np.where(index < 0, index + len(self), index)
+
     def _shard(self, number: int) -> dict[str, Tensor]:
+        """A shard's memory map, checked once per process."""
         if number not in self._open:
             shard = self.split.manifest.shards[number]
             path = self.split.folder / shard.file
-            read_header(path)
-            expected = self.split.shapes(shard.count)
-            with safe_open(path, "pt") as file:
-                there = set(file.keys())
-                missing = [name for name in self.names if name not in there]
-                if missing:
-                    raise StoreError(f"{path}: expected tensor {missing[0]!r}, found none")
-                tensors = {name: file.get_tensor(name) for name in self.names}
-            for name, tensor in tensors.items():
-                check_shape(path, name, tensor, expected.get(name))
+            self.split.check_header(path, read_header(path, SAMPLES))
+            try:
+                with safe_open(path, "pt") as file:
+                    require(path, self.names, file.keys())
+                    tensors = {name: file.get_tensor(name) for name in self.names}
+            except (SafetensorError, OSError) as error:
+                raise StoreError(f"{path}: expected readable tensors, found {error}") from error
+            arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+            check_samples(path, arrays, self.split.manifest, shard.first, shard.count)
             self._open[number] = tensors
         return self._open[number]
 

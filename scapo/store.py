@@ -1,153 +1,62 @@
 # SPDX-License-Identifier: MIT
-"""Samples, predictions and checkpoints on disk, and the only place where they are validated.
+"""Samples, predictions and checkpoints on disk; what is read is validated here.
 
-Every file is safetensors with ONE metadata entry, `scapo`, holding sorted JSON: several entries
-are written in random order, which would break byte identity. Files appear under their final name
-only when complete. Layout: `DIR/<category>/<split>/manifest.json` and shards beside it.
+Layout: `DIR/<category>/<split>/manifest.json` and shards beside it (CONTRACT 3). One file is
+written and read by `write` and `read` (of `files`), a split through `open_split` and `dataset`.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
 
+from scapo.files import (
+    Arrays,
+    Header,
+    canonical_json,
+    read,
+    read_header,
+    require,
+    sha256_bytes,
+    sha256_file,
+    write,
+    write_bytes,
+)
+from scapo.layout import LAYOUT, StoreError, check_samples, check_shape, sample_shapes
 from scapo.manifest import Manifest, ManifestError, read_manifest
 
 if TYPE_CHECKING:
     from scapo.data import SampleDataset
 
+__all__ = [
+    "CHECKPOINT",
+    "PREDICTIONS",
+    "SAMPLES",
+    "Arrays",
+    "Header",
+    "Split",
+    "StoreError",
+    "canonical_json",
+    "check_shape",
+    "dataset",
+    "find_split",
+    "open_split",
+    "read",
+    "read_header",
+    "sha256_bytes",
+    "sha256_file",
+    "write",
+    "write_bytes",
+]
+
 SAMPLES = "scapo-samples/1"
 PREDICTIONS = "scapo-predictions/1"
 CHECKPOINT = "scapo-checkpoint/1"
-
-
-@runtime_checkable
-class Shaped(Protocol):
-    """Anything with a shape: numpy or torch."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Lengths of the dimensions."""
-        ...
-
-
-Arrays = dict[str, np.ndarray]
-Header = dict[str, Any]
-
-
-class StoreError(ValueError):
-    """A file is not what it should be: `path: what was expected, what was found`."""
-
-
-def canonical_json(value: object) -> str:
-    """Sorted, compact JSON: equal values give equal text."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-
-
-def sha256_bytes(data: bytes) -> str:
-    """SHA-256 in hex."""
-    return hashlib.sha256(data).hexdigest()
-
-
-def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes in hex, read in pieces."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(1 << 20):
-            digest.update(piece)
-    return digest.hexdigest()
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write through a temporary name in the same folder, flushed to disk before the rename."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        with suppress(FileNotFoundError):
-            temporary.unlink()
-
-
-def write(path: Path, arrays: Mapping[str, np.ndarray], header: Header) -> str:
-    """Write arrays and header atomically; the same input gives the same bytes.
-
-    Returns:
-        The SHA-256 of the file.
-    """
-    contiguous = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    data = save(contiguous, metadata={"scapo": canonical_json(header)})
-    write_bytes(path, data)
-    return sha256_bytes(data)
-
-
-def _open(path: Path) -> Any:  # noqa: ANN401 - safetensors ships no types
-    return safe_open(path, "numpy")
-
-
-def read_header(path: Path, expected: str | None = None) -> Header:
-    """The header alone.
-
-    Args:
-        path: A safetensors file.
-        expected: The header's `format`, None for any.
-
-    Raises:
-        StoreError: No such file, not safetensors, no `scapo` entry, or another format.
-    """
-    if not path.is_file():
-        raise StoreError(f"{path}: expected a file, found none")
-    try:
-        with _open(path) as file:
-            metadata: dict[str, str] = file.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise StoreError(f"{path}: expected a safetensors file, found {error}") from error
-    if "scapo" not in metadata:
-        raise StoreError(
-            f"{path}: expected the metadata entry 'scapo', found {sorted(metadata) or 'none'}"
-        )
-    try:
-        header: Header = json.loads(metadata["scapo"])
-    except json.JSONDecodeError as error:
-        raise StoreError(f"{path}: expected JSON in the header, found {error}") from error
-    if not isinstance(header, dict):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise StoreError(f"{path}: expected a JSON object, found {type(header).__name__}")
-    if expected is not None and header.get("format") != expected:
-        raise StoreError(f"{path}: expected format {expected!r}, found {header.get('format')!r}")
-    return header
-
-
-def read(
-    path: Path, expected: str | None = None, names: tuple[str, ...] | None = None
-) -> tuple[Arrays, Header]:
-    """Arrays (all, or those of `names` that are there) and header.
-
-    Raises:
-        StoreError: As `read_header`, or a tensor cannot be read as numpy.
-    """
-    header = read_header(path, expected)
-    arrays: Arrays = {}
-    try:
-        with _open(path) as file:
-            for name in file.keys():  # noqa: SIM118 - the file is no mapping
-                if names is None or name in names:
-                    arrays[name] = file.get_tensor(name)
-    except (SafetensorError, TypeError, OSError) as error:
-        raise StoreError(f"{path}: expected numpy-readable tensors, found {error}") from error
-    return arrays, header
 
 
 class Split:
@@ -166,41 +75,46 @@ class Split:
             raise StoreError(str(error)) from error
 
     def shards(self, names: tuple[str, ...] | None = None) -> Iterator[Arrays]:
-        """Arrays of each shard in order, shapes checked against the manifest.
+        """Arrays of each shard in order, checked against the manifest and CONTRACT 3.
 
         Raises:
-            StoreError: A shard is missing, of another size or shape.
+            StoreError: A shard is missing, of another split, size or shape, or holds values that
+                cannot be, such as an axis that is no unit vector.
         """
         for shard in self.manifest.shards:
             path = self.folder / shard.file
-            arrays, _ = read(path, SAMPLES, names)
-            for name, array in arrays.items():
-                check_shape(path, name, array, self.shapes(shard.count).get(name))
+            arrays, header = read(path, SAMPLES, names)
+            self.check_header(path, header)
+            check_samples(path, arrays, self.manifest, shard.first, shard.count)
             yield arrays
 
     def arrays(self, *names: str) -> Arrays:
         """The named tensors of the whole split, in memory."""
-        parts = list(self.shards(names))
-        missing = [name for name in names if any(name not in part for part in parts)]
-        if missing:
-            raise StoreError(f"{self.folder}: expected tensor {missing[0]!r}, found none")
+        shapes = self.shapes(0)
+        parts: list[Arrays] = (
+            [{name: np.zeros(shapes[name], LAYOUT[name][0]) for name in names if name in shapes}]
+            if not self.manifest.shards
+            else []
+        )
+        for shard, arrays in zip(self.manifest.shards, self.shards(names), strict=True):
+            require(self.folder / shard.file, names, arrays)
+            parts.append(arrays)
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
     def shapes(self, count: int) -> dict[str, tuple[int, ...]]:
         """Expected shape of each sample tensor for `count` samples (CONTRACT 3)."""
-        n, p, j = self.manifest.points, len(self.manifest.parts), len(self.manifest.joints)
-        return {
-            "points": (count, n, 3),
-            "color": (count, n, 3),
-            "part": (count, n),
-            "camera_T_part": (count, p, 4, 4),
-            "joint_pivot": (count, j, 3),
-            "joint_axis": (count, j, 3),
-            "joint_state": (count, j),
-            "visible": (count, p),
-            "camera": (count, 6),
-            "instance": (count,),
-        }
+        return sample_shapes(self.manifest, count)
+
+    def check_header(self, path: Path, header: Header) -> None:
+        """Refuse a shard that says it belongs to another category or split.
+
+        Raises:
+            StoreError: Naming file, field, expected and found value.
+        """
+        for field in ("category", "split"):
+            want = getattr(self.manifest, field)
+            if header.get(field, want) != want:
+                raise StoreError(f"{path}: {field}: expected {want!r}, found {header[field]!r}")
 
     def verify(self) -> None:
         """Compare every shard's bytes with the manifest.
@@ -217,27 +131,7 @@ class Split:
                 raise StoreError(f"{path}: expected sha256 {shard.sha256}, found {found}")
 
 
-def check_shape(
-    path: Path, name: str, array: Shaped, expected: tuple[int | None, ...] | None
-) -> None:
-    """Refuse an array of another shape; None matches any length.
-
-    Raises:
-        StoreError: Naming file, tensor, expected and found shape.
-    """
-    if expected is None:
-        return
-    fits = len(expected) == len(array.shape) and all(
-        want in (None, have) for want, have in zip(expected, array.shape, strict=True)
-    )
-    if not fits:
-        shape = tuple("*" if want is None else want for want in expected)
-        raise StoreError(
-            f"{path}: tensor {name!r}: expected shape {shape}, found {tuple(array.shape)}"
-        )
-
-
-def find_split(folder: Path, category: str | None, split: str) -> Path:
+def find_split(folder: Path | str, category: str | None, split: str) -> Path:
     """The split's folder below `folder`, which may be the data set, the category or the split.
 
     Looked for in this order: `folder` itself, `folder/split`, `folder/category/split`, and
@@ -246,18 +140,33 @@ def find_split(folder: Path, category: str | None, split: str) -> Path:
     Raises:
         StoreError: Nothing there, or more than one.
     """
-    name = category or "*"
-    for pattern in (".", split, f"{name}/{split}", f"*/{name}/{split}"):
-        found = [folder] if pattern == "." else sorted(folder.glob(pattern))
-        found = [path for path in found if _is_split(path, category, split)]
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "none"
+        raise StoreError(f"{folder}: expected a folder of samples, found {found}")
+
+    def named(top: Path) -> list[Path]:
+        return [top / category] if category else _folders(top)
+
+    places = ([folder], [folder / split], [path / split for path in named(folder)])
+    deep = (path / split for top in _folders(folder) for path in named(top))
+    wanted = f"{category or '*'}/{split}"
+    for paths in (*places, deep):
+        found = [path for path in paths if _is_split(path, category, split)]
         if len(found) > 1:
-            raise StoreError(
-                f"{folder}: expected one {name}/{split}, found "
-                + ", ".join(str(path.relative_to(folder)) for path in found)
-            )
+            names = ", ".join(str(path.relative_to(folder)) for path in found)
+            raise StoreError(f"{folder}: expected one {wanted}, found {names}")
         if found:
             return found[0]
-    raise StoreError(f"{folder}: expected {name}/{split}/manifest.json, found none")
+    there = [path for depth in range(4) for path in folder.glob("*/" * depth + "manifest.json")]
+    names = ", ".join(sorted(str(path.parent.relative_to(folder)) for path in there)[:20])
+    raise StoreError(f"{folder}: expected {wanted}/manifest.json, found {names or 'none'}")
+
+
+def _folders(path: Path) -> list[Path]:
+    with suppress(OSError):
+        return sorted(child for child in path.iterdir() if child.is_dir())
+    return []
 
 
 def _is_split(folder: Path, category: str | None, split: str) -> bool:
@@ -265,10 +174,13 @@ def _is_split(folder: Path, category: str | None, split: str) -> bool:
     if not path.is_file():
         return False
     try:
-        data = json.loads(path.read_text())
-    except (OSError, ValueError):
+        data: object = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
         return folder.name == split
-    return data.get("split") == split and category in (None, data.get("category"))
+    if not isinstance(data, dict):
+        return folder.name == split  # so that opening it says what is wrong
+    fields = cast("dict[str, object]", data)
+    return fields.get("split") == split and category in (None, fields.get("category"))
 
 
 def open_split(folder: Path | str, category: str | None = None, split: str = "train") -> Split:
@@ -276,8 +188,24 @@ def open_split(folder: Path | str, category: str | None = None, split: str = "tr
     return Split(find_split(Path(folder), category, split))
 
 
-def dataset(folder: Path | str, category: str | None = None, split: str = "train") -> SampleDataset:
-    """A `torch.utils.data.Dataset` over a folder; see `scapo.data.SampleDataset`."""
-    from scapo.data import dataset as build  # data reads through this module
+def dataset(
+    folder: Path | str,
+    category: str | None = None,
+    split: str = "train",
+    names: Sequence[str] | None = None,
+) -> SampleDataset:
+    """A `torch.utils.data.Dataset` over a folder; see `scapo.data.SampleDataset`.
 
-    return build(folder, category, split)
+    Args:
+        folder: A data set, a category's or a split's folder.
+        category: Needed where the folder holds several.
+        split: train, val, test or another that is there.
+        names: Tensors of an item; None for all of CONTRACT 3 but `color`.
+
+    Raises:
+        StoreError: No such split, or more than one fits; a broken manifest.
+    """
+    from scapo.data import TENSORS  # data reads through this module
+    from scapo.data import dataset as build
+
+    return build(folder, category, split, TENSORS if names is None else names)
