@@ -8,6 +8,7 @@ it; sizes are PROTOCOL 4.1's. All lengths are in normalised units (mean radius 0
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -19,6 +20,7 @@ from scapo.geometry import project_rotation
 from scapo.points import gather
 from scapo.vector_neurons import (
     EdgeForm,
+    NormForm,
     VNBlock,
     VNLinear,
     edge_vectors,
@@ -46,6 +48,7 @@ class EncoderConfig:
     features: int = 170
     """Vector channels per point; the invariants number 6 times that."""
     edge: EdgeForm = "point"
+    norm: NormForm = "scale"
     projection: Projection = "svd"
 
     @property
@@ -91,23 +94,22 @@ class Encoder(nn.Module):
         super().__init__()
         self.config = config
         width, (local, wide, half, quarter) = config.width, config.branch
-        self.edge = VNBlock(3, width, affine=True)
+        block = partial(VNBlock, norm=config.norm)
+        self.edge = block(3, width, affine=True)
         self.centre = nn.Sequential(
-            VNBlock(width, width, affine=True), VNLinear(width, 1, affine=True)
+            block(width, width, affine=True), VNLinear(width, 1, affine=True)
         )
-        self.point = VNBlock(width, width)
-        self.before = nn.Sequential(
-            VNBlock(width, width), VNBlock(width, local), VNBlock(local, wide)
-        )
+        self.point = block(width, width)
+        self.before = nn.Sequential(block(width, width), block(width, local), block(local, wide))
         self.after = nn.Sequential(
-            VNBlock(wide, half), VNBlock(half, quarter), VNLinear(quarter, width)
+            block(wide, half), block(half, quarter), VNLinear(quarter, width)
         )
-        self.mix = VNBlock(2 * width, 2 * width)
-        self.widen = VNBlock(2 * width, config.features)
+        self.mix = block(2 * width, 2 * width)
+        self.widen = block(2 * width, config.features)
         self.pose = VNLinear(config.features, 3)
         self.frame = nn.Sequential(
-            VNBlock(2 * config.features, config.features),
-            VNBlock(config.features, config.features // 2),
+            block(2 * config.features, config.features),
+            block(config.features, config.features // 2),
             VNLinear(config.features // 2, 3),
         )
 
