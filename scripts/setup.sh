@@ -29,7 +29,7 @@ find_python() {
   local candidate
   if [ -n "${PYTHON:-}" ]; then
     command -v "$PYTHON" >/dev/null || fail "PYTHON=$PYTHON: no such program"
-    supported "$PYTHON" || fail "PYTHON=$PYTHON is $("$PYTHON" --version 2>&1), expected Python 3.10 to 3.13"
+    supported "$PYTHON" || fail "PYTHON=$PYTHON is $("$PYTHON" --version 2>&1 | head -n 1), expected Python 3.10 to 3.13"
     printf '%s\n' "$PYTHON"
     return
   fi
@@ -60,16 +60,27 @@ try_pip() {
   }
 }
 
+new_venv() { "$1" -m venv "$VENV" >/dev/null 2>&1 || { rm -rf "$VENV"; return 1; }; }
+
+venv_package() { "$1" -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'; }
+
+# Debian and Ubuntu ship Python without ensurepip.
+install_venv_module() {
+  local root=(env DEBIAN_FRONTEND=noninteractive apt-get -q -y -o DPkg::Lock::Timeout=300)
+  command -v apt-get >/dev/null || return 1
+  [ "$(id -u)" -eq 0 ] || { sudo -n true 2>/dev/null && root=(sudo -n "${root[@]}"); } || return 1
+  say "installing $(venv_package "$1")"
+  { "${root[@]}" update && "${root[@]}" install --no-install-recommends "$(venv_package "$1")"; } </dev/null >/dev/null 2>&1
+}
+
 make_venv() {
   local python
   python="$(find_python)"
   if ! supported "$VENV/bin/python" || { [ -n "${PYTHON:-}" ] && [ "$(version_of "$python")" != "$(version_of "$VENV/bin/python")" ]; }; then
     say "$VENV with Python $(version_of "$python")"
     rm -rf "$VENV"
-    "$python" -m venv "$VENV" >/dev/null || {
-      rm -rf "$VENV"
-      fail "$python cannot make a virtual environment; on Debian and Ubuntu: apt-get install python3-venv"
-    }
+    new_venv "$python" || { install_venv_module "$python" && new_venv "$python"; } ||
+      fail "$python cannot make a virtual environment; on Debian and Ubuntu: apt-get install $(venv_package "$python")"
   fi
   : >"$LOG"
 }
