@@ -10,47 +10,24 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.procedural import drawer, eyeglasses, laptop, oven
-from sim_assets.procedural.assembly import VERSION, Design, assemble, digest
-from sim_assets.procedural.parameters import HeldOut, draw
+from sim_assets.procedural.assembly import VERSION, Recipe, assemble, digest
+from sim_assets.procedural.parameters import draw
 
 SPLITS = ("train", "val", "test", "test-ood")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recipe:
-    """How a category is made."""
-
-    shape: type
-    """Dataclass of its free parameters."""
-    build: Callable[[Any], Design]
-    held_out: HeldOut
-    symmetric: Mapping[str, object] | None = None
-    """Parameters that make the category's swap symmetry exact; None if it has none."""
-
-
 RECIPES: dict[str, Recipe] = {
-    "laptop": Recipe(
-        shape=laptop.LaptopShape,
-        build=laptop.build,
-        held_out=laptop.HELD_OUT,
-        symmetric=laptop.SYMMETRIC,
-    ),
-    "oven": Recipe(shape=oven.OvenShape, build=oven.build, held_out=oven.HELD_OUT),
-    "drawer": Recipe(shape=drawer.DrawerShape, build=drawer.build, held_out=drawer.HELD_OUT),
-    "eyeglasses": Recipe(
-        shape=eyeglasses.EyeglassesShape,
-        build=eyeglasses.build,
-        held_out=eyeglasses.HELD_OUT,
-        symmetric=eyeglasses.SYMMETRIC,
-    ),
+    "laptop": laptop.RECIPE,
+    "oven": oven.RECIPE,
+    "drawer": drawer.RECIPE,
+    "eyeglasses": eyeglasses.RECIPE,
 }
 
 

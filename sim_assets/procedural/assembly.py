@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ import trimesh
 from scapo.categories import category as find_category
 from scapo.types import Category
 from sim_assets.articulated import ArticulatedObject, Origin, Visual
+from sim_assets.procedural.parameters import HeldOut
 
 VERSION = "scapo-procedural/1"
 """Changes whenever the same arguments give another object."""
@@ -35,6 +36,18 @@ class Design:
     axis: Sequence[Sequence[float]]
     upper: Sequence[float]
     """rad or m."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """How a category is made."""
+
+    shape: type
+    """Dataclass of its free parameters."""
+    build: Callable[[Any], Design]
+    held_out: HeldOut
+    symmetric: Mapping[str, object] | None = None
+    """Parameters that make the category's swap symmetry exact; None if it has none."""
 
 
 def painted(mesh: trimesh.Trimesh, color: RGB) -> Visual:

@@ -13,24 +13,19 @@ import numpy as np
 import trimesh
 
 from sim_assets.articulated import Visual
-from sim_assets.procedural.assembly import RGB, Design, painted, shade
+from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
     FRONT,
     at,
-    box,
-    cylinder,
-    ellipsoid,
-    lathe,
     loft,
     merged,
     placed,
     rectangle,
-    rounded_sides,
-    slab,
     superellipse,
     sweep,
 )
+from sim_assets.procedural.solids import box, cylinder, ellipsoid, lathe, rounded_sides, slab
 
 GAP = 0.002
 """Between a front and the boards beside or behind it."""
@@ -275,3 +270,6 @@ def build(s: DrawerShape) -> Design:
         axis=[(-1.0, 0.0, 0.0)],
         upper=[min(REACH, s.travel * depth)],
     )
+
+
+RECIPE = Recipe(shape=DrawerShape, build=build, held_out=HELD_OUT)

@@ -10,22 +10,19 @@ import numpy as np
 import trimesh
 
 from sim_assets.articulated import Visual
-from sim_assets.procedural.assembly import RGB, Design, painted, shade
+from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
     ALONG_Y,
     DOWN,
     at,
-    box,
-    cylinder,
     loft,
     merged,
     mirrored,
     placed,
     rectangle,
-    rounded_sides,
-    slab,
 )
+from sim_assets.procedural.solids import box, cylinder, rounded_sides, slab
 
 BLACK: RGB = (0.06, 0.06, 0.07)
 TRAVEL = radians(135.0)
@@ -259,3 +256,6 @@ def build(s: LaptopShape) -> Design:
         axis=[(0.0, 1.0, 0.0)],
         upper=[s.travel * TRAVEL],
     )
+
+
+RECIPE = Recipe(shape=LaptopShape, build=build, held_out=HELD_OUT, symmetric=SYMMETRIC)

@@ -13,24 +13,21 @@ import numpy as np
 import trimesh
 
 from sim_assets.articulated import Visual
-from sim_assets.procedural.assembly import RGB, Design, painted, shade
+from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
     ALONG_X,
     ALONG_Y,
     FRONT,
     at,
-    box,
-    cylinder,
     loft,
     merged,
     placed,
     rectangle,
-    rounded_sides,
-    slab,
     superellipse,
     sweep,
 )
+from sim_assets.procedural.solids import box, cylinder, rounded_sides, slab
 
 STEEL: RGB = (0.72, 0.73, 0.74)
 BLACK: RGB = (0.08, 0.08, 0.09)
@@ -269,3 +266,6 @@ def build(s: OvenShape) -> Design:
         axis=[(0.0, -1.0, 0.0)],
         upper=[s.travel * TRAVEL],
     )
+
+
+RECIPE = Recipe(shape=OvenShape, build=build, held_out=HELD_OUT)
