@@ -113,16 +113,17 @@ class SourceFiles:
             same = [other for other in path.parent.iterdir() if other.name.lower() == wanted]
         except (OSError, ValueError):
             return None
-        if len(same) == 1 and same[0].is_file() and self._is_inside(same[0]):
+        if len(same) == 1 and same[0].is_file() and self.is_inside(same[0]):
             self.repairs.add("File names were matched whatever their case", path.name)
             return same[0]
         return None
 
-    def _is_inside(self, path: Path) -> bool:
+    def is_inside(self, path: Path) -> bool:
+        """Whether a path, links followed, lies below the root."""
         return self.root.resolve() in path.resolve().parents
 
     def _inside(self, path: Path, name: str) -> Path:
-        if not self._is_inside(path):
+        if not self.is_inside(path):
             raise refuse(self.urdf, f"mesh files inside the folder {self.root.name!r}", repr(name))
         return path
 
@@ -134,12 +135,12 @@ class MeshResolver(Resolver):
         self.files = files
         self.mesh = mesh
 
-    def get(self, name: str) -> bytes:
+    def get(self, key: str) -> bytes:
         """The bytes of a file named in a mesh; `FileNotFoundError` tells the loader to go on."""
-        clean = PurePosixPath(str(name).strip().replace("\\", "/"))
+        clean = PurePosixPath(str(key).strip().replace("\\", "/"))
         path = self.mesh.parent / clean
-        if "\0" in str(clean) or not self.files._is_inside(path) or not path.is_file():
-            raise FileNotFoundError(str(name))
+        if "\0" in str(clean) or not self.files.is_inside(path) or not path.is_file():
+            raise FileNotFoundError(str(key))
         return self.files.read(path)
 
     def namespaced(self, namespace: str) -> MeshResolver:

@@ -15,10 +15,11 @@ Left is what is left of one who looks out of the front, -y: the wearer's left of
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from scapo.types import Category
 from sim_assets.validate import Repairs, refuse
@@ -94,22 +95,45 @@ def infer_front(
     return snapped(middle[0] - pivot[0] - axis[0] * (axis[0] @ (middle[0] - pivot[0])), up)
 
 
-def long_axis(points: Float[np.ndarray, "N 3"], normal: Vector) -> Vector:
-    """The long side of the smallest rectangle about points seen along a normal."""
+def blades(parts: Sequence[Float[np.ndarray, "_ 3"]], normal: Vector) -> Vector:
+    """The direction of closed scissors' tips: halfway between those of the two blades.
+
+    The tips' end of the long side of the smallest rectangle about the pair is the narrower one:
+    rings stand further apart than blades. Each blade points from the pivot to its far end there.
+
+    Args:
+        parts: Vertices of the two parts, the origin on the axis.
+        normal: Unit, along the axis.
+    """
     first = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
     first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-    flat = points @ np.stack([first, second], 1)
+    plane = np.stack([first, np.cross(normal, first)], 1)
+    flat = [part @ plane for part in parts]
+    points = np.concatenate(flat)
+    along, across = _rectangle(points)
+    widths = [np.abs(points[side] @ across).max() for side in _ends(points @ along)]
+    if widths[1] > widths[0]:
+        along = -along
+    tips = [part[(part @ along).argmax()] for part in flat]
+    middle = sum(tip / np.linalg.norm(tip) for tip in tips)
+    return plane @ (middle / np.linalg.norm(middle))
+
+
+def _ends(along: Float[np.ndarray, " N"]) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """The outer halves behind and before the origin."""
+    return along <= along.min() / 2, along >= along.max() / 2
+
+
+def _rectangle(
+    points: Float[np.ndarray, "N 2"],
+) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Directions of the long and the short side of the smallest rectangle about points."""
     turns = np.linspace(0, np.pi / 2, 361)[:-1]
-    sides = [np.ptp(flat @ _turn(t), axis=0) for t in turns]
-    best = int(np.argmin([a * b for a, b in sides]))
-    a, b = _turn(turns[best])[:, int(sides[best][1] > sides[best][0])]
-    return a * first + b * second
-
-
-def _turn(angle: float) -> Float[np.ndarray, "2 2"]:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s], [s, c]])
+    frames = [np.array([[np.cos(t), np.sin(t)], [-np.sin(t), np.cos(t)]]) for t in turns]
+    areas = [np.prod(np.ptp(points @ frame.T, axis=0)) for frame in frames]
+    best = frames[int(np.argmin(areas))]
+    sides = np.ptp(points @ best.T, axis=0)
+    return (best[0], best[1]) if sides[0] > sides[1] else (best[1], best[0])
 
 
 def metres_per_unit(

@@ -18,7 +18,7 @@ from sim_assets.files import MeshResolver, SourceFiles
 from sim_assets.robot import Color, Link, Robot, Shape
 from sim_assets.sides import two_sided
 from sim_assets.solids import solid
-from sim_assets.validate import MAX_FACES, AssetError, check_mesh, refuse
+from sim_assets.validate import MAX_COORDINATE, MAX_FACES, AssetError, check_mesh, refuse
 
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
 GREY: Color = (0.7, 0.7, 0.7, 1.0)
@@ -160,6 +160,8 @@ def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visu
             faces = faces[:, ::-1]
     pose = shape.link_T_shape
     moved = vertices @ pose[:3, :3].T + pose[:3, 3]
+    if np.abs(moved[np.unique(faces)]).max() > MAX_COORDINATE:
+        raise refuse(files.urdf, f"{where}: coordinates below {MAX_COORDINATE:g}", "larger ones")
     return Visual(mesh=remade(piece.mesh, moved, faces), color=shape.color or piece.color)
 
 

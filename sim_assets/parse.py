@@ -11,7 +11,6 @@ from typing import cast, get_args
 
 import numpy as np
 from jaxtyping import Float
-from lxml import etree
 
 from sim_assets.robot import (
     MOVABLE,
@@ -34,7 +33,7 @@ from sim_assets.validate import (
     check_mimics,
     refuse,
 )
-from sim_assets.xml_text import children, local, read_xml
+from sim_assets.xml_text import Element, children, local, read_xml
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +47,7 @@ class _Reader:
     def error(self, where: str, expected: str, found: str) -> AssetError:
         return refuse(self.path, f"{where}: {expected}", found)
 
-    def name(self, element: etree._Element, attribute: str, where: str) -> str:
+    def name(self, element: Element, attribute: str, where: str) -> str:
         value = (element.get(attribute) or "").strip()
         if not value:
             raise self.error(where, f"an attribute {attribute!r}", "none")
@@ -74,7 +73,7 @@ class _Reader:
     def one(self, text: str | None, where: str) -> float:
         return self.numbers(text, (1,), where)[0]
 
-    def origin(self, element: etree._Element, where: str) -> Float[np.ndarray, "4 4"]:
+    def origin(self, element: Element, where: str) -> Float[np.ndarray, "4 4"]:
         """The pose in `<origin>`, the identity where there is none."""
         found = self.first(element, "origin", where)
         if found is None:
@@ -83,7 +82,7 @@ class _Reader:
         rpy = self.numbers(found.get("rpy", "0 0 0"), (3,), f"{where} origin")
         return transform(xyz, rpy)
 
-    def first(self, element: etree._Element, tag: str, where: str) -> etree._Element | None:
+    def first(self, element: Element, tag: str, where: str) -> Element | None:
         """The only child of this tag; the first of several, which is said."""
         found = children(element, tag)
         if len(found) > 1:
@@ -126,7 +125,7 @@ def _limit_counts(reader: _Reader, links: dict[str, Link]) -> None:
         raise refuse(reader.path, f"at most {MAX_SHAPES} visual shapes", str(shapes))
 
 
-def _note_ignored(root: etree._Element, repairs: Repairs) -> None:
+def _note_ignored(root: Element, repairs: Repairs) -> None:
     """Blocks that stop other loaders, and that a picture does not need."""
     for element in children(root, "transmission"):
         if not children(element, "type"):
@@ -140,7 +139,7 @@ def _note_ignored(root: etree._Element, repairs: Repairs) -> None:
                 repairs.add("An inertial block without mass or inertia was left out", where)
 
 
-def _links(reader: _Reader, root: etree._Element) -> Iterator[Link]:
+def _links(reader: _Reader, root: Element) -> Iterator[Link]:
     seen: set[str] = set()
     for element in children(root, "link"):
         name = _new_name(reader, element, "link", seen)
@@ -149,7 +148,7 @@ def _links(reader: _Reader, root: etree._Element) -> Iterator[Link]:
         yield Link(name=name, shapes=tuple(shape for shape in shapes if shape is not None))
 
 
-def _new_name(reader: _Reader, element: etree._Element, what: str, seen: set[str]) -> str:
+def _new_name(reader: _Reader, element: Element, what: str, seen: set[str]) -> str:
     name = reader.name(element, "name", f"<{what}>")
     if name in seen:
         raise refuse(reader.path, f"one {what} named {name!r}", "several")
@@ -157,7 +156,7 @@ def _new_name(reader: _Reader, element: etree._Element, what: str, seen: set[str
     return name
 
 
-def _shape(reader: _Reader, visual: etree._Element, where: str) -> Shape | None:
+def _shape(reader: _Reader, visual: Element, where: str) -> Shape | None:
     geometry = reader.first(visual, "geometry", where)
     if geometry is None or len(geometry) == 0:
         reader.repairs.add("A visual without geometry was dropped", where)
@@ -178,7 +177,7 @@ def _shape(reader: _Reader, visual: etree._Element, where: str) -> Shape | None:
     )
 
 
-def _size(reader: _Reader, element: etree._Element, where: str) -> tuple[float, ...]:
+def _size(reader: _Reader, element: Element, where: str) -> tuple[float, ...]:
     kind = local(element)
     if kind == "mesh":
         size = reader.numbers(element.get("scale", "1 1 1"), (1, 3), f"{where} scale")
@@ -202,7 +201,7 @@ def _size(reader: _Reader, element: etree._Element, where: str) -> tuple[float, 
     return size
 
 
-def _color(reader: _Reader, material: etree._Element) -> Color | None:
+def _color(reader: _Reader, material: Element) -> Color | None:
     found = children(material, "color")
     if not found or found[0].get("rgba") is None:
         return None
@@ -216,13 +215,13 @@ def _color(reader: _Reader, material: etree._Element) -> Color | None:
     return red, green, blue, alpha
 
 
-def _joints(reader: _Reader, root: etree._Element) -> Iterator[Joint]:
+def _joints(reader: _Reader, root: Element) -> Iterator[Joint]:
     seen: set[str] = set()
     for element in children(root, "joint"):
         yield _joint(reader, element, _new_name(reader, element, "joint", seen))
 
 
-def _joint(reader: _Reader, element: etree._Element, name: str) -> Joint:
+def _joint(reader: _Reader, element: Element, name: str) -> Joint:
     where = f"joint {name!r}"
     kind = reader.name(element, "type", where)
     if kind not in get_args(Kind):
@@ -247,9 +246,7 @@ def _joint(reader: _Reader, element: etree._Element, name: str) -> Joint:
     )
 
 
-def _axis(
-    reader: _Reader, element: etree._Element, kind: str, where: str
-) -> Float[np.ndarray, " 3"]:
+def _axis(reader: _Reader, element: Element, kind: str, where: str) -> Float[np.ndarray, " 3"]:
     found = reader.first(element, "axis", where)
     if kind not in MOVABLE:
         return np.array([1.0, 0.0, 0.0])
@@ -266,7 +263,7 @@ def _axis(
 
 
 def _limits(
-    reader: _Reader, element: etree._Element, kind: str, where: str
+    reader: _Reader, element: Element, kind: str, where: str
 ) -> tuple[float | None, float | None]:
     """Lower and upper, 0 where only one is given (URDF's default); None where not numbers."""
     if kind not in ("revolute", "prismatic"):
@@ -285,7 +282,7 @@ def _limits(
     return lower + 0.0, upper + 0.0
 
 
-def _mimic(reader: _Reader, element: etree._Element, kind: str, where: str) -> Mimic | None:
+def _mimic(reader: _Reader, element: Element, kind: str, where: str) -> Mimic | None:
     found = reader.first(element, "mimic", where)
     if found is None or kind not in MOVABLE:
         return None

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from trimesh.visual import TextureVisuals
 
 from scapo.categories import category as find_category
 from scapo.types import Category
@@ -38,10 +39,19 @@ Pose = Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Model:
+    """A model as its files describe it."""
+
+    robot: Robot
+    surfaces: Surfaces
+    known: Traits
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Resting:
     """A model at rest, in coordinates of the root link and asset units."""
 
-    robot: Robot
+    model: Model
     reduction: Reduction
     rests: tuple[Rest, ...]
     poses: dict[str, Pose]
@@ -88,33 +98,42 @@ def read(
         ValueError: No such category.
     """
     spec = find_category(category)
-    repairs = Repairs()
-    root = package_root(urdf) if root is None else root
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise refuse(urdf, "a scale above zero", f"{scale}")
-    robot = parse(urdf, repairs)
-    check_robot(urdf, robot)
-    known = traits(robot)
-    files = SourceFiles(urdf=urdf, root=root, repairs=repairs)
-    for file in (urdf, *known.files):
-        files.read(file)
-    surfaces = load_links(robot, files)
-    upward = frames.direction(up or known.up, urdf)
-    reduction = reduce(robot, surfaces, spec, known)
-    rests = find_rest(robot, surfaces, reduction, spec, upward)
-    resting = _resting(robot, surfaces, reduction, rests)
-    rotation = _rotation(resting, spec, known, (up, front), repairs)
-    resting = _ordered(resting, surfaces, spec, rotation)
+    files = SourceFiles(urdf=urdf, root=root or package_root(urdf), repairs=Repairs())
+    model = load(files)
+    upward = frames.direction(up or model.known.up, urdf)
+    reduction = reduce(model.robot, model.surfaces, spec, model.known)
+    rests = find_rest(model.robot, model.surfaces, reduction, spec, upward)
+    resting = _resting(model, reduction, rests)
+    rotation = _rotation(resting, spec, (up, front), files.repairs)
+    resting = _ordered(resting, spec, rotation)
     bounds = resting.bounds(rotation)
     low, high = bounds[:, 0].min(0), bounds[:, 1].max(0)
     size = float(np.linalg.norm(high - low))
-    ratio = frames.metres_per_unit(spec, size, known.metric, scale, repairs)
+    ratio = frames.metres_per_unit(spec, size, model.known.metric, scale, files.repairs)
     similarity = np.eye(4)
     similarity[:3, :3] = ratio * rotation
     similarity[:3, 3] = -ratio * (low + high) / 2
-    thing = _object(resting, spec, similarity, files, instance_id(urdf, root))
+    thing = _object(resting, spec, similarity, files)
     check_object(urdf, thing)
     return thing
+
+
+def load(files: SourceFiles) -> Model:
+    """Parse a URDF and load its surfaces, checked but not yet brought to any category.
+
+    Raises:
+        AssetError: The model cannot be used.
+    """
+    if not files.is_inside(files.urdf):
+        raise refuse(files.urdf, f"a file inside the folder {files.root.name!r}", "one outside")
+    robot = parse(files.urdf, files.repairs)
+    known = traits(robot)
+    check_robot(files.urdf, robot, known.remark)
+    for file in (files.urdf, *known.files):
+        files.read(file)
+    return Model(robot=robot, surfaces=load_links(robot, files), known=known)
 
 
 def package_root(urdf: Path) -> Path:
@@ -127,9 +146,8 @@ def package_root(urdf: Path) -> Path:
     return folder.parent.parent if folder.name in ("urdf", "urdfs", "robots") else folder
 
 
-def _resting(
-    robot: Robot, surfaces: Surfaces, reduction: Reduction, rests: tuple[Rest, ...]
-) -> _Resting:
+def _resting(model: Model, reduction: Reduction, rests: tuple[Rest, ...]) -> _Resting:
+    robot, surfaces = model.robot, model.surfaces
     names = [joint.name for joint in reduction.joints]
     poses = robot.poses({n: r.position for n, r in zip(names, rests, strict=True)})
     rows = zip(reduction.joints, rests, reduction.inverted, strict=True)
@@ -147,7 +165,7 @@ def _resting(
         for part in reduction.parts
     )
     return _Resting(
-        robot=robot,
+        model=model,
         reduction=reduction,
         rests=rests,
         poses=poses,
@@ -160,12 +178,11 @@ def _resting(
 def _rotation(
     resting: _Resting,
     category: Category,
-    known: Traits,
     wanted: tuple[str | None, str | None],
     repairs: Repairs,
 ) -> Float[np.ndarray, "3 3"]:
     """object_R_asset: by the caller, then the source, then the joint."""
-    path = resting.robot.path
+    path, known = resting.model.robot.path, resting.model.known
     upward = frames.direction(wanted[0] or known.up, path)
     given = wanted[1] or (known.front if wanted[0] is None else None)
     if category.name == "scissors":
@@ -174,7 +191,8 @@ def _rotation(
         return frames.basis(upward, frames.direction(given, path), path)
     middle = resting.bounds(np.eye(3))[1:].mean(1)
     front = frames.infer_front(category, upward, resting.pivot, resting.axis, middle)
-    repairs.add(f"The front was told from the joint: {frames.name_of(front)}")
+    if frames.name_of(front) != "-x":
+        repairs.add(f"The front was told from the joint: {frames.name_of(front)}")
     return frames.basis(upward, front, path)
 
 
@@ -183,35 +201,27 @@ def _along_blades(resting: _Resting, upward: Vector, front: str | None) -> Float
     normal = resting.axis[0]
     if normal @ upward < -1e-6:
         normal = -normal
-    points = np.concatenate([resting.points(0), resting.points(1)])
-    along = frames.long_axis(points, normal)
-    if front is not None:
-        wanted = frames.direction(front, resting.robot.path)
-        along = -along if along @ wanted > 0 else along
-        return np.stack([along, np.cross(normal, along), normal])
-    rotation = np.stack([along, np.cross(normal, along), normal])
-    local = (points - resting.pivot[0]) @ rotation.T
-    widths = [np.abs(local[side, 1]).mean() for side in (local[:, 0] < 0, local[:, 0] > 0)]
-    turn = np.diag([-1.0, -1.0, 1.0]) if widths[1] > widths[0] else np.eye(3)
-    return turn @ rotation
+    parts = [resting.points(part) - resting.pivot[0] for part in range(2)]
+    along = frames.blades(parts, normal)
+    if front is not None and along @ frames.direction(front, resting.model.robot.path) > 0:
+        along = -along
+    return np.stack([along, np.cross(normal, along), normal])
 
 
-def _ordered(
-    resting: _Resting, surfaces: Surfaces, category: Category, rotation: Float[np.ndarray, "3 3"]
-) -> _Resting:
+def _ordered(resting: _Resting, category: Category, rotation: Float[np.ndarray, "3 3"]) -> _Resting:
     """Left before right (left is -y); the scissors blade from which the other opens about +z."""
-    robot, reduction, rests = resting.robot, resting.reduction, resting.rests
+    reduction, rests = resting.reduction, resting.rests
     if len(rests) == 2:
         middle = resting.bounds(rotation).mean(1)
         if middle[1, 1] > middle[2, 1]:
-            return _resting(robot, surfaces, reordered(reduction), rests[::-1])
+            return _resting(resting.model, reordered(reduction), rests[::-1])
     elif category.name == "scissors" and (rotation @ resting.axis[0])[2] < 0:
-        return _resting(robot, surfaces, exchanged(reduction), rests)
+        return _resting(resting.model, exchanged(reduction), rests)
     return resting
 
 
 def _object(
-    resting: _Resting, category: Category, object_T_asset: Pose, files: SourceFiles, name: str
+    resting: _Resting, category: Category, object_T_asset: Pose, files: SourceFiles
 ) -> ArticulatedObject:
     ratio = float(np.cbrt(np.linalg.det(object_T_asset[:3, :3])))
     rotation = object_T_asset[:3, :3] / ratio
@@ -230,7 +240,7 @@ def _object(
     axis = resting.axis @ rotation.T
     return ArticulatedObject(
         category=category,
-        instance=name,
+        instance=instance_id(files.urdf, files.root),
         visuals=visuals,
         pivot=pivot,
         axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
@@ -239,7 +249,7 @@ def _object(
             source=files.urdf.resolve().relative_to(files.root.resolve()).as_posix(),
             sha256=files.digest(),
             object_T_asset=object_T_asset,
-            rest={name: float(q) for name, q in resting.robot.positions(at).items()},
+            rest={name: float(q) for name, q in resting.model.robot.positions(at).items()},
             joint_names=tuple(joint.name for joint in joints),
             sign=tuple(rest.direction for rest in resting.rests),
             repairs=files.repairs.sentences(),
@@ -256,7 +266,7 @@ def _merged(visuals: list[Visual]) -> tuple[Visual, ...]:
     """Untextured surfaces of one colour as one: renderers pay for each."""
     groups: dict[object, list[Visual]] = {}
     for k, visual in enumerate(visuals):
-        textured = visual.mesh.visual.kind == "texture"
+        textured = isinstance(visual.mesh.visual, TextureVisuals)
         groups.setdefault(k if textured else visual.color, []).append(visual)
     return tuple(_joined(group) for group in groups.values())
 

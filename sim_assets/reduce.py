@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from math import pi, radians
 
@@ -22,7 +22,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from scapo.types import Category
+from scapo.types import Category, JointSpec
 from sim_assets.articulated import Visual
 from sim_assets.robot import Joint, Robot
 from sim_assets.sources import Traits
@@ -68,8 +68,8 @@ def reduce(robot: Robot, surfaces: Surfaces, category: Category, traits: Traits)
     Raises:
         AssetError: Too few joints of the right kind that move something visible.
     """
-    kind = category.joints[0].kind
-    found = candidates(robot, surfaces, category, traits)
+    spec = category.joints[0]
+    found = candidates(robot, surfaces, spec, category.words, traits)
     count = len(category.joints)
     choices = itertools.combinations(found[:MAX_PAIRED], count)
     fitting = [
@@ -80,7 +80,7 @@ def reduce(robot: Robot, surfaces: Surfaces, category: Category, traits: Traits)
     if not fitting:
         raise refuse(
             robot.path,
-            f"{count} {kind} joint{'s' * (count > 1)} for the category {category.name!r}",
+            f"{count} {spec.kind} joint{'s' * (count > 1)} for the category {category.name!r}",
             f"{len(found)} that could be, of {kinds(robot.joints.values())}{traits.remark}",
         )
     result = max(fitting, key=lambda choice: _order(choice[0]))[1]
@@ -115,14 +115,21 @@ def _order(chosen: tuple[Candidate, ...]) -> tuple[tuple[bool, bool, bool], floa
 
 
 def candidates(
-    robot: Robot, surfaces: Surfaces, category: Category, traits: Traits
+    robot: Robot, surfaces: Surfaces, spec: JointSpec, moving: Collection[str], traits: Traits
 ) -> list[Candidate]:
-    """Joints of the category's kind with travel and something visible to move, best first.
+    """Joints of one kind with travel and something visible to move, best first.
+
+    Args:
+        robot: The model.
+        surfaces: Of its links.
+        spec: The kind and the largest travel.
+        moving: Words that name the link of such a joint.
+        traits: Names of the links.
 
     Raises:
         AssetError: None of them is sound; the reason is that of the first.
     """
-    kind = category.joints[0].kind
+    kind = spec.kind
     poses = robot.poses({})
     size = diagonal(surfaces, poses)
     unit = 1.0 if kind == "revolute" else size
@@ -136,9 +143,9 @@ def candidates(
         except AssetError as error:
             reasons.append(error)
             continue
-        area = swept(robot, surfaces, joint, poses, travel(joint, category))
+        area = swept(robot, surfaces, joint, poses, travel(joint, spec))
         named = words(traits.labels.get(joint.child, joint.child), joint.child, joint.name)
-        rank = (bool(named & set(category.words)), joint.kind != "continuous", joint.mimic is None)
+        rank = (bool(named & set(moving)), joint.kind != "continuous", joint.mimic is None)
         if area > 0:
             result.append(Candidate(joint=joint, rank=rank, swept=area))
     if not result and reasons:
@@ -146,13 +153,12 @@ def candidates(
     return sorted(result, key=lambda c: (c.rank, c.swept), reverse=True)
 
 
-def travel(joint: Joint, category: Category) -> float:
-    """Rad or asset units; revolute joints no further than their category's."""
-    upper = category.joints[0].upper
+def travel(joint: Joint, spec: JointSpec) -> float:
+    """Rad or asset units; revolute joints no further than the category's."""
     if joint.kind == "continuous" or joint.lower is None or joint.upper is None:
-        return upper
+        return spec.upper
     span = joint.upper - joint.lower
-    return span if joint.kind == "prismatic" else min(span, upper)
+    return span if joint.kind == "prismatic" else min(span, spec.upper)
 
 
 def swept(

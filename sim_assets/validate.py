@@ -165,8 +165,13 @@ def check_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
         raise refuse(path, "triangles with an area", "only degenerate ones")
 
 
-def check_robot(path: Path, robot: Robot) -> None:
+def check_robot(path: Path, robot: Robot, remark: str = "") -> None:
     """Something to see and something that moves.
+
+    Args:
+        path: Named in the error.
+        robot: The model.
+        remark: What else is known of its joints.
 
     Raises:
         AssetError: No visual shapes, or no joint that moves.
@@ -174,16 +179,15 @@ def check_robot(path: Path, robot: Robot) -> None:
     if not any(link.shapes for link in robot.links.values()):
         raise refuse(path, "visual shapes", "none in any link")
     if not any(joint.kind in MOVABLE for joint in robot.joints.values()):
-        raise refuse(
-            path, "a revolute, continuous or prismatic joint", kinds(robot.joints.values())
-        )
+        found = kinds(robot.joints.values()) + remark
+        raise refuse(path, "a revolute, continuous or prismatic joint", found)
 
 
 def kinds(joints: Iterable[Joint]) -> str:
     """How many joints of each kind there are, in words."""
     found = [joint.kind for joint in joints]
     counts = [f"{found.count(kind)} {kind}" for kind in sorted(set(found))]
-    return ", ".join(counts) + " joints" if counts else "no joint"
+    return f"{', '.join(counts)} joint{'s' * (len(found) > 1)}" if counts else "no joint"
 
 
 def check_object(path: Path, asset: ArticulatedObject) -> None:

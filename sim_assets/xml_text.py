@@ -6,11 +6,14 @@ from __future__ import annotations
 import codecs
 import re
 from pathlib import Path
+from typing import Any
 
-from lxml import etree
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
 from sim_assets.validate import MAX_URDF_BYTES, Repairs, refuse
 
+Element = Any
+"""lxml's, which has no types."""
 _BOMS = (
     (codecs.BOM_UTF8, "utf-8"),
     (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -21,7 +24,7 @@ _COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
 _PREFIX = re.compile(r"(?:</?|\s)([A-Za-z_][\w.-]*):[A-Za-z_][\w.-]*(?=[\s=/>])")
 
 
-def read_xml(path: Path, repairs: Repairs) -> etree._Element:
+def read_xml(path: Path, repairs: Repairs) -> Element:
     """The `<robot>` element of a file.
 
     A byte order mark, white space before the declaration, a version that does not exist,
@@ -45,17 +48,17 @@ def read_xml(path: Path, repairs: Repairs) -> etree._Element:
     return root
 
 
-def local(element: etree._Element) -> str:
+def local(element: Element) -> str:
     """An element's tag without its namespace; empty for comments and instructions."""
     return etree.QName(element).localname if isinstance(element.tag, str) else ""
 
 
-def children(element: etree._Element, tag: str) -> list[etree._Element]:
+def children(element: Element, tag: str) -> list[Element]:
     """Child elements of this tag, whatever their namespace."""
     return [child for child in element if local(child) == tag]
 
 
-def _is_xacro(element: etree._Element) -> bool:
+def _is_xacro(element: Element) -> bool:
     space = etree.QName(element).namespace if isinstance(element.tag, str) else None
     return space is not None and "xacro" in space
 
@@ -105,7 +108,7 @@ def _without_comments(text: str, repairs: Repairs) -> str:
     return _COMMENT.sub("", text)
 
 
-def _parse(text: str, path: Path, repairs: Repairs) -> etree._Element:
+def _parse(text: str, path: Path, repairs: Repairs) -> Element:
     try:
         return _fromstring(text)
     except etree.XMLSyntaxError as error:
@@ -122,7 +125,7 @@ def _parse(text: str, path: Path, repairs: Repairs) -> etree._Element:
         raise refuse(path, "well-formed XML", str(error)) from error
 
 
-def _fromstring(text: str) -> etree._Element:
+def _fromstring(text: str) -> Element:
     parser = etree.XMLParser(
         resolve_entities=False,
         no_network=True,
