@@ -8,7 +8,6 @@ its part's pose lies on that part's surface to a few micrometres.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -18,10 +17,10 @@ from jaxtyping import Float, Int, UInt8
 from scapo.camera import Intrinsics
 from scapo.points import farthest_points
 from sim_assets.articulated import ArticulatedObject
+from sim_assets.options import Sampling
 from sim_assets.renderer import BACKGROUND, Frame, face_colors
 from sim_assets.views import generator
 
-Sampling = Literal["random", "fps"]
 SURFACE_SAMPLES = 512
 """Per part, for `visible`: its standard error is 0.02 or less."""
 TOLERANCE = 1e-3
@@ -149,8 +148,9 @@ class Surface:
             for part, mesh in enumerate(self.meshes)
         ]
         self.points = np.stack([points for points, _ in drawn])  # (P, K, 3)
-        self.normals = np.stack([mesh.face_normals[face] for mesh, (_, face) in
-                                 zip(self.meshes, drawn, strict=True)])
+        self.normals = np.stack(
+            [mesh.face_normals[face] for mesh, (_, face) in zip(self.meshes, drawn, strict=True)]
+        )
         self.colors = [face_colors(visuals) for visuals in thing.visuals]
         self.areas = np.array([mesh.area for mesh in self.meshes])
         self.tolerance = TOLERANCE * float(np.linalg.norm(thing.extents()))

@@ -85,7 +85,7 @@ def generate(
         "split": request.split,
         "seed": request.seed,
         "count": request.count,
-        "options": {**request.options(), "instances": len(assets)},
+        "options": request.options(),
     }
     with (
         Ledger(folder, identity, versions) as ledger,
@@ -95,7 +95,9 @@ def generate(
         complete = _complete(ledger, finished)
         if complete is not None:
             return complete
-        entries, refused = ledger.entries(assets) or _describe(pool, assets, running)
+        entries, refused = ledger.entries(assets) or _describe(
+            pool, assets, request.instances, running
+        )
         if not entries:
             why = "; ".join(refused.values())
             raise GenerateError(f"{folder}: expected objects that can be read, found none: {why}")
@@ -140,8 +142,11 @@ def _make(ledger: Ledger, pool: Pool[Any, Any], work: _Work, running: Running) -
         )
         for plan in plan_shards(request, used, instances)
     ]
-    kept = {job.plan.file: work.finished[job.plan.file] for job in jobs
-            if job.plan.file in work.finished}
+    kept = {
+        job.plan.file: work.finished[job.plan.file]
+        for job in jobs
+        if job.plan.file in work.finished
+    }
     made = _render(ledger, pool, [job for job in jobs if job.plan.file not in kept], running)
     shards = [{**kept, **made}[job.plan.file] for job in jobs]
     failed = {name: why for shard in shards for name, why in shard.failed.items()}
@@ -156,23 +161,29 @@ def _make(ledger: Ledger, pool: Pool[Any, Any], work: _Work, running: Running) -
 
 
 def _describe(
-    pool: Pool[Any, Any], assets: Sequence[Asset], running: Running
+    pool: Pool[Any, Any], assets: Sequence[Asset], wanted: int, running: Running
 ) -> tuple[tuple[Entry, ...], dict[str, str]]:
-    """Read every object once; those that cannot be read come with the reason."""
+    """Read objects until there are enough; those that cannot be read come with the reason."""
     found: dict[str, Entry] = {}
     refused: dict[str, str] = {}
-    running.progress("objects", 0, len(assets))
-    for outcome in pool.run(describe, assets):
-        name = outcome.job.name
-        if outcome.result is not None:
-            found[name] = outcome.result
-        elif running.strict:
-            raise GenerateError(_reason(name, outcome))
-        else:
-            refused[name] = outcome.reason
-        running.progress("objects", len(found) + len(refused), len(assets))
-    entries = tuple(found[asset.name] for asset in assets if asset.name in found)
-    return entries, {asset.name: refused[asset.name] for asset in assets if asset.name in refused}
+    waiting = list(assets)
+    running.progress("objects", 0, wanted)
+    while waiting and len(found) < wanted:
+        batch, waiting = waiting[: wanted - len(found)], waiting[wanted - len(found) :]
+        for outcome in pool.run(describe, batch):
+            name = outcome.job.name
+            if outcome.result is not None:
+                found[name] = outcome.result
+            elif running.strict:
+                raise GenerateError(_reason(name, outcome))
+            else:
+                refused[name] = outcome.reason
+            running.progress("objects", len(found), wanted)
+    order = [asset.name for asset in assets]
+    return (
+        tuple(found[name] for name in order if name in found),
+        {name: refused[name] for name in order if name in refused},
+    )
 
 
 def _render(
@@ -251,9 +262,7 @@ def _manifest(
     )
 
 
-def _statistics(
-    request: Request, done: Sequence[ShardDone], refused: int
-) -> dict[str, float]:
+def _statistics(request: Request, done: Sequence[ShardDone], refused: int) -> dict[str, float]:
     views, draws = sum(shard.views for shard in done), sum(shard.draws for shard in done)
     return {
         "views": views,

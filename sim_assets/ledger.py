@@ -76,9 +76,7 @@ class Ledger:
     def __exit__(self, *exc: object) -> None:
         os.close(self._lock)  # which unlocks
 
-    def entries(
-        self, assets: Sequence[Asset]
-    ) -> tuple[tuple[Entry, ...], dict[str, str]] | None:
+    def entries(self, assets: Sequence[Asset]) -> tuple[tuple[Entry, ...], dict[str, str]] | None:
         """The objects as first read and those refused, if that was recorded."""
         if self.plan is None:
             return None
@@ -226,5 +224,3 @@ def _tuples(row: dict[str, Any]) -> dict[str, Any]:
         return tuple(frozen(item) for item in value) if isinstance(value, list) else value
 
     return {name: frozen(value) for name, value in row.items()}
-
-

@@ -31,6 +31,9 @@ class Request:
     split: str
     seed: int
     count: int
+    """Samples."""
+    instances: int
+    """Objects asked for."""
     source: str
     """`procedural`, or what kind of folder the models come from."""
     source_options: dict[str, Any]
@@ -46,6 +49,7 @@ class Request:
             "camera": camera,
             "noise": "none",
             "source": self.source,
+            "instances": self.instances,
             **self.source_options,
         }
 

@@ -144,10 +144,10 @@ def _plane_depth(
     vertices: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     hit: Int[np.ndarray, " K"],
-    eye: Float[np.ndarray, "3"],
+    eye: Float[np.ndarray, " 3"],
     rays: Float[np.ndarray, "K 3"],
 ) -> Float[np.ndarray, " K"]:
-    """s with eye + s * ray in the plane of the triangle hit; rays have z = 1, so s is depth."""
+    """S with eye + s * ray in the plane of the triangle hit; rays have z = 1, so s is depth."""
     depth = np.full(len(hit), np.inf)
     seen = hit >= 0
     a, b, c = (vertices[faces[hit[seen], k]] for k in range(3))

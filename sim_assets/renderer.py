@@ -93,8 +93,10 @@ def resolve_backend(name: str) -> Backend:
         if why[backend] is None:
             return backend
     reasons = "; ".join(f"{backend}: {reason}" for backend, reason in why.items())
-    raise RenderError(f"expected a renderer that works here, found none ({reasons}); "
-                      "`scapo-data doctor` says what to install")
+    raise RenderError(
+        f"expected a renderer that works here, found none ({reasons}); "
+        "`scapo-data doctor` says what to install"
+    )
 
 
 def make_renderer(backend: Backend, *, color: bool = False) -> AbstractRenderer:
@@ -131,6 +133,6 @@ _CHECK: dict[str, Callable[[], str | None]] = {
 
 
 def face_colors(visuals: tuple[Visual, ...]) -> UInt8[np.ndarray, "F 3"]:
-    """sRGB colour of each face of a part, in the order of `ArticulatedObject.part_mesh`."""
+    """SRGB colour of each face of a part, in the order of `ArticulatedObject.part_mesh`."""
     rows = [np.tile(visual.color[:3], (len(visual.mesh.faces), 1)) for visual in visuals]
     return np.clip(np.concatenate(rows) * 255 + 0.5, 0, 255).astype(np.uint8)

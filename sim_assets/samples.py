@@ -6,17 +6,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.cloud import Cloud, Sampling, Surface, count_visible, sample_frames, truth
+from sim_assets.cloud import Cloud, Surface, count_visible, sample_frames, truth
+from sim_assets.options import Protocol, Sampling
 from sim_assets.renderer import AbstractRenderer, Backend, Frame
 from sim_assets.views import Outline, View, draw_views, generator
 
-Protocol = Literal["joint", "isolated", "full"]
 Row = dict[str, np.ndarray]
 """One sample: the tensors of CONTRACT 3 without their first dimension."""
 

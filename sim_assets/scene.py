@@ -12,11 +12,10 @@ import os
 import warnings
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject, Visual

@@ -114,9 +114,7 @@ def _renderer(backend: Backend, color: bool) -> AbstractRenderer:
     return make_renderer(backend, color=color)
 
 
-def _write(
-    job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, str]
-) -> ShardDone:
+def _write(job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, str]) -> ShardDone:
     digest = hashlib.sha256(b"".join(shot.plan for shot in shots)).hexdigest()
     done = {
         "count": len(rows),

@@ -102,7 +102,7 @@ def draw_views(
     return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
 
 
-def draw_direction(window: Window, rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def draw_direction(window: Window, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
     """Unit vector from the object to the camera, uniform on the window's piece of the sphere."""
     azimuth = radians(rng.uniform(*window.azimuth))
     z = rng.uniform(*np.sin(np.radians(window.elevation)))
@@ -117,7 +117,7 @@ def direction_angles(direction: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, 
     return np.degrees(np.stack([azimuth, elevation], -1))
 
 
-def look_along(gaze: Float[np.ndarray, "3"], roll: float) -> Float[np.ndarray, "3 3"]:
+def look_along(gaze: Float[np.ndarray, " 3"], roll: float) -> Float[np.ndarray, "3 3"]:
     """Rotation to a camera frame with z along `gaze`, x level, then rolled about z."""
     level = np.cross(gaze, [0.0, 0.0, 1.0])
     if np.linalg.norm(level) < 1e-6:
@@ -190,7 +190,7 @@ def _image_box(
 def _product(
     matrix: Float[np.ndarray, "B 3 3"], points: Float[np.ndarray, "B V 3"]
 ) -> Float[np.ndarray, "B V 3"]:
-    """matrix @ point for each point, element by element."""
+    """Multiply each point by its matrix, element by element."""
     columns = [points[..., k, None] * matrix[:, None, :, k] for k in range(3)]
     return columns[0] + columns[1] + columns[2]
 

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: MIT
+"""The verbs of `scapo-data`: one dataclass each, whose fields are the flags."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from sim_assets.console import progress_bar, show_made, watched
+from sim_assets.options import DataOptions
+
+Name = Literal[
+    "laptop",
+    "safe",
+    "oven",
+    "washer",
+    "eyeglasses",
+    "basket",
+    "drawer",
+    "suitcase",
+    "scissors",
+]
+"""`scapo.CATEGORIES`, written out for the type checker and the help."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doctor:
+    """Say which renderers work here, and what supplies those that do not."""
+
+    def run(self, console: Console) -> int:
+        """Print the report; 0 where something renders."""
+        from sim_assets.doctor import render, report
+
+        found = report()
+        console.print(render(found))
+        return 0 if found.backend else 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Build:
+    """Write procedural assets as URDF and OBJ: OUT/CATEGORY/INSTANCE/mobility.urdf."""
+
+    category: tyro.conf.Positional[Name]
+    """What to build."""
+    out: Path
+    """Folder for the assets."""
+    count: int = 10
+    """Number of instances."""
+    seed: int = 1
+    """Of the shapes."""
+    split: Literal["train", "val", "test", "test-ood"] = "train"
+    """Splits share no instance."""
+
+    def run(self, console: Console) -> int:
+        """Write them, and print the folder."""
+        from sim_assets.build import build
+
+        paths = build(
+            self.category, count=self.count, seed=self.seed, out=self.out, split=self.split
+        )
+        written = list(watched(console, "assets", paths, self.count))
+        console.print(f"{len(written)} assets in {self.out / self.category}", soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """Say of each model of a folder whether it can be used: accepted, repaired or refused."""
+
+    path: tyro.conf.Positional[Path]
+    """A folder, searched recursively, or one .urdf file."""
+    json: Path | None = None
+    """Write the results to this file as well."""
+    category: Name | None = None
+    """Check as objects of this category; default: that some joint can be used."""
+    up: str | None = None
+    """Which axis of the URDF's root link is up, such as z or -y."""
+    front: str | None = None
+    """Which axis the front faces."""
+    scale: float | None = None
+    """Metres per unit of the URDF."""
+    workers: int = os.cpu_count() or 1
+    """Processes."""
+
+    def run(self, console: Console) -> int:
+        """Print one line per model; 1 if any is refused."""
+        from sim_assets.check import Options, Result, check, exit_code, write_report
+
+        colors = {"accepted": "green", "repaired": "yellow", "refused": "red"}
+
+        def show(result: Result) -> None:
+            why = result.reason or "; ".join(result.repairs)
+            status = f"[{colors[result.status]}]{result.status:8}[/]"
+            line = f"{status}  {escape(result.path)}  {escape(why)}".rstrip()
+            console.print(line, highlight=False, soft_wrap=True)
+
+        options = Options(category=self.category, up=self.up, front=self.front, scale=self.scale)
+        results = check(self.path, options, workers=self.workers, on_result=show)
+        if self.json is not None:
+            write_report(results, self.json)
+        counts = {name: sum(r.status == name for r in results) for name in colors}
+        console.print(", ".join(f"{count} {name}" for name, count in counts.items()))
+        return exit_code(results)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Generate:
+    """Make labelled point clouds: OUT/CATEGORY/SPLIT/manifest.json and shards.
+
+    Started again after an interruption it goes on; the bytes are the same either way.
+    """
+
+    category: tyro.conf.Positional[Name]
+    """What to show."""
+    out: Path
+    """Folder of the data set."""
+    data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
+    workers: int = os.cpu_count() or 1
+    """Processes."""
+    engine: Literal["local"] = "local"
+    """Where they run."""
+    timeout: float = 300.0
+    """Seconds without a sign of life after which an object counts as hanging and is left out."""
+    strict: bool = False
+    """Stop at the first object that fails."""
+
+    def run(self, console: Console) -> int:
+        """Make them, print a summary, and name the objects that failed."""
+        from sim_assets.generate import Running, generate
+        from sim_assets.request import make_request, versions
+
+        started = time.monotonic()
+        request, assets = make_request(self.category, self.data)
+        folder = self.out / self.category / self.data.split
+        with progress_bar(console) as show:
+            made = generate(
+                request,
+                assets,
+                folder,
+                versions(request.settings.backend, request.settings.protocol),
+                Running(
+                    workers=self.workers,
+                    timeout=self.timeout,
+                    strict=self.strict,
+                    progress=show,
+                ),
+            )
+        show_made(console, made, time.monotonic() - started)
+        return 1 if made.failed else 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Info:
+    """Say what a data set holds, and whether its shards are whole."""
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+
+    def run(self, console: Console) -> int:
+        """Print counts, histograms and digests of every split; 1 if a shard is damaged."""
+        from sim_assets.info import describe_folder
+
+        whole = True
+        for report in describe_folder(self.path):
+            console.print(report.text)
+            whole &= report.whole
+        return 0 if whole else 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preview:
+    """Draw samples of a data set as one picture: clouds by part, with joint axes."""
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+    out: Path
+    """The picture, FILE.png."""
+    count: int = 24
+    """Samples, spread over each split."""
+    category: Name | None = None
+    """Only this one."""
+    split: str | None = None
+    """Only this one."""
+
+    def run(self, console: Console) -> int:
+        """Draw it."""
+        from sim_assets.preview import draw_preview
+
+        drawn = draw_preview(self.path, self.out, self.count, self.category, self.split)
+        console.print(f"{drawn} samples drawn in {self.out}", soft_wrap=True)
+        return 0
+
+
+VERBS: dict[str, type] = {
+    "doctor": Doctor,
+    "build": Build,
+    "check": Check,
+    "generate": Generate,
+    "info": Info,
+    "preview": Preview,
+}
+"""In the order of the help."""
