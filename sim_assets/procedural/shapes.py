@@ -171,3 +171,20 @@ def merged(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
         np.concatenate([m.faces + offset for m, offset in zip(meshes, offsets, strict=True)]),
         process=False,
     )
+
+
+def bezier(
+    first: Sequence[float], corner: Sequence[float], last: Sequence[float], count: int
+) -> Ring:
+    """`count` points of the parabola from first to last, tangent to the lines to the corner."""
+    t = np.linspace(0.0, 1.0, count)[:, None]
+    ends = (1 - t) ** 2 * np.asarray(first) + t**2 * np.asarray(last)
+    return ends + 2 * t * (1 - t) * np.asarray(corner)
+
+
+def resampled(loop: Loop, count: int) -> Loop:
+    """`count` points at equal distances along the loop."""
+    closed = np.concatenate([loop, loop[:1]])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    wanted = np.arange(count) * length[-1] / count
+    return np.column_stack([np.interp(wanted, length, closed[:, k]) for k in range(2)])

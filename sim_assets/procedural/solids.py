@@ -85,3 +85,18 @@ def ellipsoid(size: Sequence[float], count: int = 16) -> trimesh.Trimesh:
     angle[[0, -1]] *= 0.985  # small flat poles in place of degenerate triangles
     mesh = lathe([(float(np.cos(a)), float(np.sin(a))) for a in angle], count)
     return trimesh.Trimesh(mesh.vertices * np.asarray(size) / 2, mesh.faces, process=False)
+
+
+def tub(outer: Sequence[float], wall: float, floor: float, radius: float) -> trimesh.Trimesh:
+    """An open box standing on z = 0 about the z axis.
+
+    Args:
+        outer: Width (x), depth (y), height (z).
+        wall: Thickness of the sides.
+        floor: Thickness of the bottom.
+        radius: Of the outer corners seen from above.
+    """
+    width, depth, height = outer
+    outside = rectangle(width, depth, radius)
+    inside = rectangle(width - 2 * wall, depth - 2 * wall, radius - wall)
+    return loft([at(outside, 0.0), at(outside, height), at(inside, height), at(inside, floor)])
