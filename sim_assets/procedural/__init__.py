@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.procedural import drawer, eyeglasses, laptop, oven, safe
+from sim_assets.procedural import drawer, eyeglasses, laptop, oven, safe, washer
 from sim_assets.procedural.assembly import VERSION, Recipe, assemble, digest
 from sim_assets.procedural.parameters import draw
 
@@ -27,6 +27,7 @@ RECIPES: dict[str, Recipe] = {
     "laptop": laptop.RECIPE,
     "safe": safe.RECIPE,
     "oven": oven.RECIPE,
+    "washer": washer.RECIPE,
     "drawer": drawer.RECIPE,
     "eyeglasses": eyeglasses.RECIPE,
 }
