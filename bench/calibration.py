@@ -58,7 +58,7 @@ class Fitted:
 
 
 def _plain(values: np.ndarray) -> Any:  # noqa: ANN401
-        """Nested lists, NaN as None."""
+    """Nested lists, NaN as None."""
     if values.ndim:
         return [_plain(value) for value in values]
     return float(values) if np.isfinite(values) else None

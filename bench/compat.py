@@ -18,10 +18,21 @@ from jaxtyping import Bool, Float, Int
 
 from bench.compat_chain import Chain, inverse_chain, straight_chain
 from bench.compat_eap import eap_calibration, eap_iou, eap_rotation
-from bench.matching import project_rotations, rotation_degrees
+from bench.matching import nearest_orthogonal, project_rotations, rotation_degrees
 from bench.ordering import order_scores, part_orders
 
-__all__ = ["RECORD", "SYMMETRY", "eap_calibration", "eap_iou", "eap_rotation", "opalign"]
+__all__ = [
+    "RECORD",
+    "SYMMETRY",
+    "Chain",
+    "consensus",
+    "eap_calibration",
+    "eap_iou",
+    "eap_rotation",
+    "opalign",
+    "score_record",
+    "standardise",
+]
 
 Geometry = Literal["compat", "se3"]
 
@@ -68,7 +79,8 @@ def opalign(
             pipeline is run: the first `n_train` samples calibrate, the others are tested.
             Otherwise the predictions `pred_rot` (B,P,3,3), `pred_trans` (B,P,3), `pred_pivot` and
             `pred_dir` (B,J,3) are compared as they are. Optional: `background` (labels 1..P, 0 is
-            ignored), `expand` (B,) dividing lengths where `use_expand`, `joint_type` r or p.
+            ignored), `expand` (B,) dividing lengths where `use_expand`, `joint_type` r or p,
+            `symmetry` (3,3) or None instead of that of `shape_type`.
         n_train: Instead of the record's.
         ransac_seed: Of `numpy.random.RandomState`, instead of the record's (1234).
         geometry: `se3` corrects the first three defects.
@@ -89,27 +101,36 @@ def opalign(
     count = int(record["n_train"]) if n_train is None else n_train
     seed = int(record.get("ransac_seed", 1234)) if ransac_seed is None else ransac_seed
     revolute = geometry == "compat" or str(record.get("joint_type", "r")) == "r"
-    train, test = _rows(record, slice(0, count)), _rows(record, slice(count, None))
-    ordered, _, _, _ = _reorder(train)
     chain = Chain(revolute=revolute, corrected=geometry == "se3")
-    standard = straight_chain(train, ordered, chain)
-    canon, ratios = _consensus(standard, seed)
-    rotation, shift = inverse_chain(test, canon, chain)
-    turn = _float(test["R_select"])[:, None]
-    joints = (
-        (turn @ (_float(test["S_joint"]) + _float(test["T_select"])[:, None])[..., None])[..., 0],
-        (turn @ _float(test["S_drct"])[..., None])[..., 0],
-    )
-    out = _score(test, (rotation, shift), joints)
-    return out | {
-        "pred_pose": _poses(rotation, shift),
-        "pred_pivot_input": joints[0],
-        "pred_dir_input": joints[1],
+    standard = standardise(_rows(record, slice(0, count)), chain)
+    canon, ratios = consensus(standard, seed)
+    return score_record(_rows(record, slice(count, None)), canon, chain) | {
         "standardized_gt_pose": standard,
         "canon_rot": canon[0],
         "canon_trans": canon[1],
         "ransac_rot_inlier_ratio": ratios[0],
         "ransac_trans_inlier_ratio": ratios[1],
+    }
+
+
+def standardise(record: Mapping[str, Any], chain: Chain) -> Float[np.ndarray, "B P 4 4"]:
+    """True part poses, reordered, brought to canonical space."""
+    return straight_chain(record, _reorder(record)[0], chain)
+
+
+def score_record(
+    record: Mapping[str, Any], canon: tuple[np.ndarray, np.ndarray], chain: Chain
+) -> dict[str, Any]:
+    """Errors of test samples for the canonical part poses `canon`: see `opalign`."""
+    rotation, shift = inverse_chain(record, canon, chain)
+    turn = _float(record["R_select"])[:, None]
+    moved = _float(record["S_joint"]) + _float(record["T_select"])[:, None]
+    pivot = (turn @ moved[..., None])[..., 0]
+    direction = (turn @ _float(record["S_drct"])[..., None])[..., 0]
+    return _score(record, (rotation, shift), (pivot, direction)) | {
+        "pred_pose": _poses(rotation, shift),
+        "pred_pivot_input": pivot,
+        "pred_dir_input": direction,
     }
 
 
@@ -151,7 +172,7 @@ def _reorder(
     slot_of = np.argsort(order, 1)
     known = label >= first
     moved = np.take_along_axis(slot_of, np.where(known, label - first, 0), 1) + first
-    symmetry = SYMMETRY.get(str(record.get("shape_type", "")))
+    symmetry = record.get("symmetry", SYMMETRY.get(str(record.get("shape_type", ""))))
     if symmetry is not None:
         swapped = best == 1
         pose[swapped, :, :3, :3] = pose[swapped, :, :3, :3] @ np.array(symmetry, np.float64)
@@ -173,7 +194,6 @@ def _score(
     """PROTOCOL 1.3 to 1.5 in the published reading."""
     true_pose, true_joint, label, known = _reorder(record)
     expand = _float(record["expand"])[:, None] if _scaled(record) else 1.0
-    u, _, vt = np.linalg.svd(pose[0])
     axis = true_joint[..., 3:] / np.linalg.norm(true_joint[..., 3:], axis=-1, keepdims=True)
     pred_axis = joints[1] / np.linalg.norm(joints[1], axis=-1, keepdims=True)
     offset = joints[0] - true_joint[..., :3]
@@ -183,7 +203,7 @@ def _score(
         # The published difference of squares can be negative on a perfect pivot; this cannot.
         "pivot_err": np.linalg.norm(np.cross(offset, axis), axis=-1) / expand,
         "dir_err_deg": np.degrees(np.arctan2(sine, np.abs((axis * pred_axis).sum(-1)))),
-        "rot_err_deg": rotation_degrees(true_pose[..., :3, :3], u @ vt),
+        "rot_err_deg": rotation_degrees(true_pose[..., :3, :3], nearest_orthogonal(pose[0])),
         "trans_err": np.linalg.norm(true_pose[..., :3, 3] - pose[1], axis=-1) / expand,
         "ordered_gt_pose": true_pose,
         "ordered_gt_joint": true_joint,
@@ -208,12 +228,13 @@ def _hard_iou(
     return np.stack(columns, 1)
 
 
-def _consensus(
+def consensus(
     standard: Float[np.ndarray, "B P 4 4"], seed: int
 ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[float, float]]:
     """Best rotations and best translations of 100 draws of 5 samples, chosen independently."""
     # The published search draws from numpy's global generator after numpy.random.seed(seed).
     generator = np.random.RandomState(seed)
+    standard = standard[np.isfinite(standard).all((1, 2, 3))]
     rotations, shifts = standard[..., :3, :3], standard[..., :3, 3]
     best_turn, best_shift = 0, 0
     turn, shift = np.zeros(rotations.shape[1:]), np.zeros(shifts.shape[1:])

@@ -48,13 +48,19 @@ def reorder_joints(
     return out
 
 
+def nearest_orthogonal(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
+    """U V^T of the singular value decomposition, reflections included; NaN if not finite."""
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
+    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
+    return np.where(finite, u @ vt, np.nan)
+
+
 def project_rotations(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
     """Nearest rotations (SVD, det +1); NaN where an entry is not finite."""
-    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))
-    safe = np.where(finite[..., None, None], matrix, np.eye(3))
-    u, _, vt = np.linalg.svd(safe)
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
+    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return np.where(finite[..., None, None], u @ vt, np.nan)
+    return np.where(finite, u @ vt, np.nan)
 
 
 def rotation_degrees(

@@ -35,30 +35,53 @@ class Interval:
 
 
 def interval(
-    values: np.ndarray, instance: Int[np.ndarray, " B"], *, resamples: int = RESAMPLES
+    values: np.ndarray,
+    instance: Int[np.ndarray, " B"],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = BOOTSTRAP_SEED,
 ) -> Interval:
     """Mean over all defined values of (B, K) or (B,), resampled by instance.
 
     Args:
         values: NaN where undefined.
         instance: Which object each of the B samples shows.
-        resamples: Bootstrap draws, from a fixed seed.
+        resamples: Bootstrap draws.
+        seed: Of the draws.
     """
+    table = np.asarray(values, np.float64).reshape(len(values), -1)
+    known = table[~np.isnan(table)]
+    if known.size == 0:
+        nan = float("nan")
+        return Interval(mean=nan, low=nan, high=nan, count=0, undefined=int(table.size))
+    low, high = bounds(resampled_means(table, instance, resamples=resamples, seed=seed))
+    return Interval(
+        mean=float(known.mean()),
+        low=low,
+        high=high,
+        count=int(known.size),
+        undefined=int(table.size - known.size),
+    )
+
+
+def bounds(means: Float[np.ndarray, " R"]) -> tuple[float, float]:
+    """The 95 % interval of resampled means."""
+    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)
+
+
+def resampled_means(
+    values: np.ndarray,
+    instance: Int[np.ndarray, " B"],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = BOOTSTRAP_SEED,
+) -> Float[np.ndarray, " R"]:
+    """The mean of the defined values in each resample; a resample without one is left out."""
     table = np.asarray(values, np.float64).reshape(len(values), -1)
     defined = ~np.isnan(table)
     total, count = _by_instance(np.where(defined, table, 0).sum(1), defined.sum(1), instance)
-    if count.sum() == 0:
-        nan = float("nan")
-        return Interval(mean=nan, low=nan, high=nan, count=0, undefined=int(defined.size))
-    means = _ratio(_draws(len(total), resamples), total, count)
-    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Interval(
-        mean=float(total.sum() / count.sum()),
-        low=float(low),
-        high=float(high),
-        count=int(count.sum()),
-        undefined=int(defined.size - count.sum()),
-    )
+    return _ratio(_draws(len(total), resamples, seed), total, count)
 
 
 def _by_instance(
@@ -68,9 +91,9 @@ def _by_instance(
     return np.bincount(index, total), np.bincount(index, count.astype(np.float64))
 
 
-def _draws(instances: int, resamples: int) -> Int[np.ndarray, "R I"]:
+def _draws(instances: int, resamples: int, seed: int) -> Int[np.ndarray, "R I"]:
     """How often each instance is drawn in each resample."""
-    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    generator = np.random.default_rng(seed)
     share = np.full(instances, 1 / instances)
     return generator.multinomial(instances, share, size=resamples)
 

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: MIT
+"""`scapo-bench` = `python -m bench`: train, predict, score and tabulate.
+
+A verb is a frozen dataclass in `bench.verbs` (or beside its function) whose fields are the flags,
+with a method `run(console)`; `VERBS` lists them. Ends 0 on success, 1 on bad input or a failed
+job with one line, 2 on wrong usage.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, Union
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from bench.verbs import VERBS
+
+DESCRIPTION = "Train, predict, score and tabulate methods of articulated pose estimation."
+
+
+def _commands() -> Any:  # noqa: ANN401 - a union made at run time
+    commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in VERBS.items()]
+    return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb and end the process."""
+    command: Any = tyro.cli(
+        _commands(),
+        prog="scapo-bench",
+        description=DESCRIPTION,
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+    )
+    try:
+        command.run(Console())
+    except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+        line = " ".join(str(error).split())
+        Console(stderr=True, soft_wrap=True).print(f"scapo-bench: {escape(line)}", highlight=False)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

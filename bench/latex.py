@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: MIT
+"""Tables as LaTeX documents of one page or more (booktabs, longtable)."""
+
+from __future__ import annotations
+
+import re
+
+from bench.table_model import DASH, Block, Cell, Marks, Row, Table
+
+_ESCAPES = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "°": r"$^\circ$", "†": r"$^\dagger$",
+    "±": r"$\pm$", "–": "--", "×": r"$\times$", "<": r"$<$", ">": r"$>$", "|": r"$|$",
+}  # fmt: skip
+
+PREAMBLE = r"""\documentclass{article}
+\usepackage[a4paper,landscape,margin=12mm]{geometry}
+\usepackage{amssymb,booktabs,longtable}
+\usepackage[T1]{fontenc}
+\usepackage[utf8]{inputenc}
+\pagestyle{empty}
+\begin{document}
+\scriptsize
+\setlength{\tabcolsep}{3pt}
+"""
+
+
+def escape(text: str) -> str:
+    """Text without LaTeX's special characters; what the fonts lack becomes `?`."""
+    out = "".join(_ESCAPES.get(char, char) for char in text)
+    return re.sub(r"[^\x00-\x7f]", "?", out)
+
+
+def to_latex(table: Table) -> str:
+    """A document of one `longtable`, with the notes below."""
+    width = 5 + len(table.columns)
+    head = [*_over(table), _heads(table) + r" \\"]
+    lines = [
+        PREAMBLE.rstrip(),
+        rf"\noindent\textbf{{Table {table.number}.}} {escape(table.title)}.\par\medskip",
+        rf"\begin{{longtable}}{{@{{}}ll{'c' * 3}{'r' * len(table.columns)}@{{}}}}",
+        r"\toprule",
+        *head,
+        r"\midrule",
+        r"\endhead",
+        r"\bottomrule",
+        r"\endfoot",
+    ]
+    for number, block in enumerate(table.blocks):
+        if number:
+            lines.append(r"\midrule")
+        lines += _block(block, width)
+    lines.append(r"\end{longtable}")
+    lines += [rf"\noindent {escape(note)}\par" for note in table.notes]
+    return "\n".join([*lines, r"\end{document}", ""])
+
+
+def _over(table: Table) -> list[str]:
+    if not table.groups:
+        return []
+    cells = [r"& & \multicolumn{3}{c}{Supervision}"]
+    rules, column = [r"\cmidrule(lr){3-5}"], 6
+    for name, width in table.groups:
+        cells.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(name)}}}")
+        if name:
+            rules.append(rf"\cmidrule(lr){{{column}-{column + width - 1}}}")
+        column += width
+    return [" & ".join(cells) + r" \\", " ".join(rules)]
+
+
+def _heads(table: Table) -> str:
+    names = ("Method", "", "Pose", "Seg.", "Joint", *table.columns)
+    return " & ".join(escape(name) for name in names)
+
+
+def _block(block: Block, width: int) -> list[str]:
+    heading = rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textbf{{{escape(block.heading)}}}}} \\*"
+    return [heading, *(_row(row) for row in block.rows)]
+
+
+def _row(row: Row) -> str:
+    fields = [escape(row.method), row.source, *_checks(row.marks), *map(_cell, row.cells)]
+    return " & ".join(fields) + r" \\"
+
+
+def _checks(marks: Marks | None) -> list[str]:
+    return ["", "", ""] if marks is None else [r"$\checkmark$" if mark else "" for mark in marks]
+
+
+def _cell(cell: Cell) -> str:
+    text = "--" if cell.shown == DASH else escape(cell.shown)
+    if cell.best:
+        text = rf"\textbf{{{text}}}"
+    if cell.flag:
+        text += r"$^\dagger$"
+    if cell.deviation is not None:
+        text += rf"\,$\pm$\,{cell.deviation:.{cell.decimals}f}"
+    if cell.low is not None and cell.high is not None:
+        text += rf" {{\tiny[{cell.low:.{cell.decimals}f}, {cell.high:.{cell.decimals}f}]}}"
+    return text
