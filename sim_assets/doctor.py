@@ -25,10 +25,10 @@ from rich.text import Text
 PROBE_SECONDS = 120.0
 
 PACKAGES: dict[str, tuple[str, ...]] = {
-    "core": ("torch", "numpy", "roma", "safetensors", "jaxtyping", "rich", "tyro"),
+    "core": ("torch", "numpy", "scipy", "roma", "safetensors", "jaxtyping", "rich", "tyro"),
     "sim": ("sapien", "embreex", "trimesh", "yourdfpy", "lxml", "pillow"),
     "gpu-sim": ("mani-skill",),
-    "bench": ("pandas", "jinja2", "scipy", "small-gicp", "matplotlib", "tensorboard"),
+    "bench": ("pandas", "jinja2", "small-gicp", "matplotlib", "tensorboard"),
     "view": ("viser",),
     "cluster": ("ray",),
 }
