@@ -23,7 +23,16 @@ class Intrinsics:
 
     @staticmethod
     def from_fov(fov_y: float, width: int, height: int) -> Intrinsics:
-        """Square pixels, principal point at the centre, vertical field of view in radians."""
+        """Square pixels, principal point at the centre, vertical field of view in radians.
+
+        Raises:
+            ValueError: A field of view outside (0, pi), or an image without pixels.
+        """
+        if not (0 < fov_y < math.pi and width > 0 and height > 0):
+            raise ValueError(
+                "camera: expected a field of view between 0 and pi and an image of 1 x 1 or more, "
+                f"found {fov_y} and {width} x {height}"
+            )
         focal = height / 2 / math.tan(fov_y / 2)
         return Intrinsics(
             fx=focal, fy=focal, cx=width / 2, cy=height / 2, width=width, height=height

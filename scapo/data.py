@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import SupportsIndex
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from scapo.layout import UNLABELLED, StoreError, check_samples
+from scapo.layout import LAYOUT, UNLABELLED, StoreError, check_samples
 from scapo.store import SAMPLES, Split, open_split, read_header, require
 from scapo.types import Joints, Labels, Observation
 
@@ -55,9 +56,9 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         """Without the open memory maps: a worker opens its own."""
         return {**self.__dict__, "_open": {}}
 
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
+    def __getitem__(self, index: SupportsIndex) -> dict[str, Tensor]:
         """Sample `index`; negative counts from the end."""
-        return self.__getitems__([index])[0]
+        return self.__getitems__([int(index)])[0]
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Tensor]]:
         """Several samples: the call that DataLoader makes for a batch."""
@@ -75,18 +76,26 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         shard_of = np.searchsorted(self._ends, index, side="right")
         order = np.argsort(shard_of, kind="stable")
         pieces: dict[str, list[Tensor]] = {name: [] for name in self.names}
-        for shard in np.unique(shard_of) if len(index) else [0]:
+        for shard in np.unique(shard_of):
             rows = order[shard_of[order] == shard]
             local = torch.from_numpy(index[rows] - self.split.manifest.shards[shard].first)
             for name, tensor in self._shard(int(shard)).items():
                 pieces[name].append(tensor[local])
         back = torch.from_numpy(np.argsort(order))
-        out = {name: torch.cat(rows)[back] for name, rows in pieces.items()}
+        out = {
+            name: torch.cat(rows)[back] if rows else self._nothing(name)
+            for name, rows in pieces.items()
+        }
         if "part" in out:
             part = out["part"].long()
             out["part"] = torch.where(part == UNLABELLED, -1, part)
         out["index"] = torch.from_numpy(index)
         return out
+
+    def _nothing(self, name: str) -> Tensor:
+        """A tensor of no samples."""
+        kind = LAYOUT[name][0] if name in LAYOUT else "float32"
+        return torch.zeros(self.split.shapes(0).get(name, (0,)), dtype=getattr(torch, kind))
 
     def _inside(self, indices: Tensor) -> np.ndarray:
         """The indices from 0 on."""

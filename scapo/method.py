@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -49,7 +49,7 @@ class Step:
     """On the device of the batch; the only source of randomness in `losses`."""
 
 
-class AbstractMethod(nn.Module):
+class AbstractMethod(nn.Module, ABC):
     """A method of articulated pose estimation for one category.
 
     `fit.fit` calls `losses` with `labels.keep(method.supervision)`: what the method does not

@@ -91,9 +91,7 @@ def test_verify_finds_changed_and_missing_shards(folder: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(bytes(data))
-    with pytest.raises(
-        StoreError, match=r"00001.safetensors: expected sha256 \w{64}, found \w{64}"
-    ):
+    with pytest.raises(StoreError, match=r"00001.safetensors: expected sha256 \w+, found \w+"):
         split.verify()
     path.unlink()
     with pytest.raises(StoreError, match=r"00001.safetensors: expected a shard of the manifest"):
@@ -178,10 +176,10 @@ def test_a_split_in_a_folder_of_another_name_is_not_taken_for_it(tmp_path: Path)
 def test_an_empty_a_missing_and_no_folder(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"expected laptop/train/manifest.json, found none$"):
         find_split(tmp_path, "laptop", "train")
-    with pytest.raises(StoreError, match="gone: expected a folder of samples, found none$"):
+    with pytest.raises(StoreError, match=r"gone: expected a folder of samples, found none$"):
         find_split(tmp_path / "gone", "laptop", "train")
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="file: expected a folder of samples, found a file$"):
+    with pytest.raises(StoreError, match=r"file: expected a folder of samples, found a file$"):
         open_split(tmp_path / "file", "laptop")
 
 
