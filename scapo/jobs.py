@@ -160,7 +160,10 @@ class Pool(Generic[Job, Result]):
 
 
 def _outcome(
-    worker: _Worker, result: Any, failure: Literal["error", "died", "hung"] | None, reason: str
+    worker: _Worker,
+    result: Any,  # noqa: ANN401
+    failure: Literal["error", "died", "hung"] | None,
+    reason: str,
 ) -> Outcome[Any, Any]:
     return Outcome(
         job=worker.job, result=result, failure=failure, reason=reason, label=worker.label

@@ -88,10 +88,12 @@ def resolve_backend(name: str) -> Backend:
     if name != "auto" and name not in get_args(Backend):
         raise RenderError(f"backend: expected auto, sapien or raycast, found {name!r}")
     why = {}
-    for backend in get_args(Backend) if name == "auto" else (name,):
-        why[backend] = _CHECK[backend]()
-        if why[backend] is None:
-            return backend
+    known: tuple[Backend, ...] = get_args(Backend)
+    for backend in known:
+        if name in ("auto", backend):
+            why[backend] = _CHECK[backend]()
+            if why[backend] is None:
+                return backend
     reasons = "; ".join(f"{backend}: {reason}" for backend, reason in why.items())
     raise RenderError(
         f"expected a renderer that works here, found none ({reasons}); "

@@ -12,6 +12,7 @@ import os
 import warnings
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -47,14 +48,20 @@ def find_device() -> sapien.Device:
     """
     reasons = []
     for name in ("cuda", *(f"pci:{i}" for i in range(4))):
-        try:
-            device = sapien.Device(name)
-            if device.can_render():
-                return device
-            reasons.append(f"{name} cannot render")
-        except RuntimeError as error:
-            reasons.append(str(error))
-    raise RenderError(f"expected a Vulkan device for SAPIEN, found none ({reasons[0]})")
+        found = _device(name)
+        if isinstance(found, sapien.Device):
+            return found
+        reasons.append(found)
+    raise RenderError(f"expected a Vulkan device for SAPIEN, found none ({'; '.join(reasons[:2])})")
+
+
+def _device(name: str) -> sapien.Device | str:
+    """The device if it renders, else why not."""
+    try:
+        device = sapien.Device(name)
+    except RuntimeError as error:
+        return str(error)
+    return device if device.can_render() else f"{name} cannot render"
 
 
 def versions() -> dict[str, str]:
@@ -73,23 +80,12 @@ class SapienRenderer(AbstractRenderer):
         """
         self.device = find_device()
         self.color = color
-        self.scene: sapien.Scene | None = None
+        self.stage: _Stage | None = None
 
     def open(self, thing: ArticulatedObject) -> None:
-        """A new scene with one entity per part: reused scenes grow in memory."""
+        """A new scene for each object: one whose objects are exchanged grows in memory."""
         self.close()
-        self.object = thing
-        scene = sapien.Scene([sapien.render.RenderSystem(self.device)])
-        scene.set_ambient_light([1, 1, 1])
-        self.parts = [self._entity(visuals) for visuals in thing.visuals]
-        for entity in self.parts:
-            scene.add_entity(entity)
-        ids = [entity.per_scene_id for entity in self.parts]
-        self.part_of_id = np.full(max(ids) + 1, BACKGROUND, np.uint8)
-        self.part_of_id[ids] = np.arange(len(ids))
-        self.radius = np.linalg.norm(np.stack(_corners(thing)), axis=-1).max()
-        self.scene, self.camera, self.size = scene, None, (0, 0)
-        self.hidden: frozenset[int] = frozenset()
+        self.stage = _Stage(self.device, thing, self.color)
 
     def render(
         self,
@@ -99,42 +95,52 @@ class SapienRenderer(AbstractRenderer):
         only: int | None = None,
     ) -> Frame:
         """See `AbstractRenderer.render`."""
-        if self.scene is None:
+        if self.stage is None:
             raise RenderError("expected an open object, found none")
-        for entity, object_T_part in zip(self.parts, self.object.pose(state), strict=True):
-            entity.set_pose(sapien.Pose(object_T_part))
-        self._show(only)
-        self._aim(camera_T_object, camera)
-        self.scene.update_render()
-        self.camera.take_picture()
-        return self._read()
+        self.stage.pose(state)
+        self.stage.show(only)
+        self.stage.aim(camera_T_object, camera)
+        return self.stage.shoot()
 
     def close(self) -> None:
         """Drop the scene with all it holds."""
-        self.scene = self.camera = None
-        self.parts = []
+        self.stage = None
 
-    def _entity(self, visuals: tuple[Visual, ...]) -> sapien.Entity:
-        body = RenderBodyComponent()
-        if self.color:
-            for visual in visuals:
-                body.attach(_shape(*_double_sided(visual.mesh), visual.color))
-        else:  # one draw call per part
-            body.attach(_shape(*_merged([_double_sided(visual.mesh) for visual in visuals])))
-        entity = sapien.Entity()
-        entity.add_component(body)
-        return entity
 
-    def _show(self, only: int | None) -> None:
-        hidden = frozenset() if only is None else frozenset(range(len(self.parts))) - {only}
+class _Stage:
+    """A scene with one object: an entity per part, and a camera."""
+
+    def __init__(self, device: sapien.Device, thing: ArticulatedObject, color: bool) -> None:
+        self.thing, self.color = thing, color
+        self.scene = sapien.Scene([sapien.render.RenderSystem(device)])
+        self.parts = [_entity(visuals, color) for visuals in thing.visuals]
+        for entity in self.parts:
+            self.scene.add_entity(entity)
+        ids = [entity.per_scene_id for entity in self.parts]
+        self.part_of_id = np.full(max(ids) + 1, BACKGROUND, np.uint8)
+        self.part_of_id[ids] = np.arange(len(ids))
+        self.hidden: frozenset[int] = frozenset()
+        self.reach = _reach(thing)
+        self.size = (0, 0)
+        self.eye = sapien.Entity()
+        self.camera: Any = None
+        """A component of `eye`, made anew when the picture's size changes."""
+
+    def pose(self, state: Float[np.ndarray, " J"]) -> None:
+        for entity, object_T_part in zip(self.parts, self.thing.pose(state), strict=True):
+            entity.set_pose(sapien.Pose(object_T_part))
+
+    def show(self, only: int | None) -> None:
+        parts = frozenset(range(len(self.parts)))
+        hidden = frozenset[int]() if only is None else parts - {only}
         for part in hidden ^ self.hidden:
             component = self.parts[part].components[0]
             component.disable() if part in hidden else component.enable()
         self.hidden = hidden
 
-    def _aim(self, camera_T_object: Float[np.ndarray, "4 4"], camera: Intrinsics) -> None:
-        if self.camera is None or self.size != (camera.width, camera.height):
-            self._add_camera(camera)
+    def aim(self, camera_T_object: Float[np.ndarray, "4 4"], camera: Intrinsics) -> None:
+        if self.size != (camera.width, camera.height):
+            self._make_camera(camera)
         object_T_camera = np.linalg.inv(camera_T_object)
         object_T_robot = np.eye(4)
         object_T_robot[:3, :3] = object_T_camera[:3, :3] @ CAMERA_T_ROBOT
@@ -142,22 +148,15 @@ class SapienRenderer(AbstractRenderer):
         self.eye.set_pose(sapien.Pose(object_T_robot))
         # A tight depth range keeps surfaces a fraction of a millimetre apart in order.
         distance = float(np.linalg.norm(camera_T_object[:3, 3]))
-        near = max(distance - 2 * self.radius, 0.02 * distance, 1e-4)
+        near = max(distance - 1.1 * self.reach, 0.02 * distance, 1e-4)
+        far = distance + 1.1 * self.reach
         self.camera.set_perspective_parameters(
-            near, distance + 2 * self.radius, camera.fx, camera.fy, camera.cx, camera.cy, 0.0
+            near, far, camera.fx, camera.fy, camera.cx, camera.cy, 0.0
         )
 
-    def _add_camera(self, camera: Intrinsics) -> None:
-        if self.camera is not None:
-            self.scene.remove_entity(self.eye)
-        shader = COLOR_SHADER if self.color else SHADER
-        self.camera = RenderCameraComponent(camera.width, camera.height, str(shader))
-        self.size = (camera.width, camera.height)
-        self.eye = sapien.Entity()
-        self.eye.add_component(self.camera)
-        self.scene.add_entity(self.eye)
-
-    def _read(self) -> Frame:
+    def shoot(self) -> Frame:
+        self.scene.update_render()
+        self.camera.take_picture()
         position = self.camera.get_picture("Position")
         if not self.color:
             part = self.part_of_id[position[..., 1].astype(np.intp)]
@@ -168,16 +167,43 @@ class SapienRenderer(AbstractRenderer):
         color = np.clip(self.camera.get_picture("Color")[..., :3] * 255 + 0.5, 0, 255)
         return Frame(depth=depth, part=part, color=color.astype(np.uint8))
 
+    def _make_camera(self, camera: Intrinsics) -> None:
+        if self.camera is not None:
+            self.scene.remove_entity(self.eye)
+            self.eye = sapien.Entity()
+        self.size = (camera.width, camera.height)
+        shader = COLOR_SHADER if self.color else SHADER
+        self.camera = RenderCameraComponent(*self.size, str(shader))
+        self.eye.add_component(self.camera)
+        self.scene.add_entity(self.eye)
 
-def _corners(thing: ArticulatedObject) -> list[Float[np.ndarray, "K 3"]]:
-    """Where the object may reach: corners of every surface at rest and with all joints open."""
-    boxes = []
-    for fraction in (0.0, 0.5, 1.0):
-        for visuals, pose in zip(thing.visuals, thing.pose(fraction * thing.upper), strict=True):
-            for visual in visuals:
-                box = trimesh.bounds.corners(visual.mesh.bounds)
-                boxes.append(box @ pose[:3, :3].T + pose[:3, 3])
-    return [np.concatenate(boxes)]
+
+def _entity(visuals: tuple[Visual, ...], color: bool) -> sapien.Entity:
+    """A part: a shape per colour, or one for all, which is one draw call."""
+    body = RenderBodyComponent()
+    surfaces = [_double_sided(visual.mesh) for visual in visuals]
+    if color:
+        for surface, visual in zip(surfaces, visuals, strict=True):
+            body.attach(_shape(*surface, visual.color))
+    else:
+        body.attach(_shape(*_merged(surfaces)))
+    entity = sapien.Entity()
+    entity.add_component(body)
+    return entity
+
+
+def _reach(thing: ArticulatedObject) -> float:
+    """Radius about the object's origin that no point of it leaves at any state, m."""
+    radius = np.zeros(len(thing.visuals))
+    for part, visuals in enumerate(thing.visuals):
+        corners = np.concatenate([trimesh.bounds.corners(v.mesh.bounds) for v in visuals])
+        radius[part] = np.linalg.norm(corners, axis=1).max()
+    for j, joint in enumerate(thing.category.joints):
+        # About an axis a point moves at most twice as far as it is from the pivot.
+        turning = joint.kind == "revolute"
+        extra = 2 * np.linalg.norm(thing.pivot[j]) if turning else thing.upper[j]
+        radius[joint.child] += extra
+    return float(radius.max())
 
 
 def _double_sided(
