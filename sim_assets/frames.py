@@ -6,7 +6,8 @@ Where neither the caller nor the source says where the front is, it is told from
 - a door or drawer: where it moves to when it begins to open; a lid that opens upwards: from its
   hinge towards its middle, as a laptop's user sits opposite to the hinge;
 - eyeglasses: from the temples' middles to their hinges;
-- basket: so that the handles' hinges run along x;
+- basket: along the handles' hinges, so that these run along x (of the two ends the one nearer to
+  the root link's -x or -y), whatever the source says;
 - scissors: z is the axis (on the side that is up), the blades run along x.
 
 Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
@@ -86,6 +87,9 @@ def infer_front(
     """
     if category.joints[0].kind == "prismatic":
         return snapped(axis[0], up)
+    if category.rest == "tallest":
+        along = snapped(axis[0], up)
+        return -along if along.sum() > 0 else along
     if len(category.joints) > 1:
         return snapped((pivot - middle).mean(0), up)
     motion = np.cross(axis[0], middle[0] - pivot[0])
@@ -99,7 +103,7 @@ def blades(parts: Sequence[Float[np.ndarray, "_ 3"]], normal: Vector) -> Vector:
     """The direction of closed scissors' tips: halfway between those of the two blades.
 
     The tips' end of the long side of the smallest rectangle about the pair is the narrower one:
-    rings stand further apart than blades. Each blade points from the pivot to its far end there.
+    rings stand further apart than blades. Each blade points from the pivot to the middle of its far end there.
 
     Args:
         parts: Vertices of the two parts, the origin on the axis.
@@ -114,9 +118,18 @@ def blades(parts: Sequence[Float[np.ndarray, "_ 3"]], normal: Vector) -> Vector:
     widths = [np.abs(points[side] @ across).max() for side in _ends(points @ along)]
     if widths[1] > widths[0]:
         along = -along
-    tips = [part[(part @ along).argmax()] for part in flat]
+    tips = [_far_end(part, along) for part in flat]
     middle = sum(tip / np.linalg.norm(tip) for tip in tips)
     return plane @ (middle / np.linalg.norm(middle))
+
+
+def _far_end(
+    points: Float[np.ndarray, "N 2"], along: Float[np.ndarray, " 2"]
+) -> Float[np.ndarray, " 2"]:
+    """Middle of the box about the points at the end."""
+    reach = points @ along
+    end = points[reach > 0.97 * reach.max()]
+    return (end.min(0) + end.max(0)) / 2
 
 
 def _ends(along: Float[np.ndarray, " N"]) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:

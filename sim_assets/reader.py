@@ -184,7 +184,8 @@ def _rotation(
     """object_R_asset: by the caller, then the source, then the joint."""
     path, known = resting.model.robot.path, resting.model.known
     upward = frames.direction(wanted[0] or known.up, path)
-    given = wanted[1] or (known.front if wanted[0] is None else None)
+    by_source = wanted[0] is None and category.rest != "tallest"
+    given = wanted[1] or (known.front if by_source else None)
     if category.name == "scissors":
         return _along_blades(resting, upward, wanted[1])
     if given is not None:

@@ -11,6 +11,7 @@ open. So the limits are scanned for the state that `Category.rest` describes:
 
 A limit that comes within 2 % of the best is taken before a state inside the limits, as mechanisms
 stop where they close; of two such limits the one nearer to zero.
+Where no limit will do, zero is taken if it comes within 10 %.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ from sim_assets.robot import Joint, Robot
 STEPS = 61
 TOLERANCE = 0.02
 """Of the measure's range over the scan."""
+ZERO_TOLERANCE = 0.1
+"""The same for zero, where no limit will do."""
 FLAT = 0.005
 """A measure that changes by less, relative to its size, says nothing."""
 
@@ -146,8 +149,9 @@ def _best(profile: Profile, joint: Joint, low: float, high: float) -> float:
     ends = [q for q, value in ((low, values[0]), (high, values[-1])) if value <= enough]
     if ends and joint.kind != "continuous":
         return min(ends, key=abs)
-    # Zero, which the model's author chose, before other states that do as well.
-    if profile(zero) <= enough:
+    # Zero, which the model's author chose, before other states that do nearly as well: a door
+    # without limits that is pushed into its body makes the hull smaller still.
+    if profile(zero) <= values.min() + ZERO_TOLERANCE * spread:
         return zero
     k = int(values.argmin())
     fine = np.linspace(grid[max(k - 1, 0)], grid[min(k + 1, STEPS - 1)], 41)

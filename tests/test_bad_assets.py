@@ -155,6 +155,7 @@ def gltf(uri: str) -> bytes:
     ).encode()
 
 
+ODD = b"<?xml version='1.0' encoding='x-no'?><a/>"
 NOISE = np.random.default_rng(0).bytes(4096)
 FILES: dict[str, tuple[str, bytes, str]] = {
     "empty": ("body.obj", b"", "an empty file"),
