@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.procedural import drawer, eyeglasses, laptop, oven, safe, suitcase, washer
+from sim_assets.procedural import drawer, eyeglasses, laptop, oven, safe, scissors, suitcase, washer
 from sim_assets.procedural.assembly import VERSION, Recipe, assemble, digest
 from sim_assets.procedural.parameters import draw
 
@@ -30,6 +30,7 @@ RECIPES: dict[str, Recipe] = {
     "washer": washer.RECIPE,
     "drawer": drawer.RECIPE,
     "suitcase": suitcase.RECIPE,
+    "scissors": scissors.RECIPE,
     "eyeglasses": eyeglasses.RECIPE,
 }
 
