@@ -14,8 +14,9 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from scapo.files import require
 from scapo.layout import LAYOUT, UNLABELLED, StoreError, check_samples
-from scapo.store import SAMPLES, Split, open_split, read_header, require
+from scapo.store import SAMPLES, Arrays, Split, open_split, read_header
 from scapo.types import Joints, Labels, Observation
 
 TENSORS = (
@@ -46,7 +47,7 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         self.names = tuple(names)
         counts = [shard.count for shard in split.manifest.shards]
         self._ends = np.cumsum(counts)
-        self._open: dict[int, dict[str, Tensor]] = {}
+        self._open: dict[int, Arrays] = {}
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -74,28 +75,28 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         """
         index = self._inside(indices)
         shard_of = np.searchsorted(self._ends, index, side="right")
-        order = np.argsort(shard_of, kind="stable")
-        pieces: dict[str, list[Tensor]] = {name: [] for name in self.names}
+        out = {name: self._room(name, len(index)) for name in self.names}
         for shard in np.unique(shard_of):
-            rows = order[shard_of[order] == shard]
-            local = torch.from_numpy(index[rows] - self.split.manifest.shards[shard].first)
-            for name, tensor in self._shard(int(shard)).items():
-                pieces[name].append(tensor[local])
-        back = torch.from_numpy(np.argsort(order))
-        out = {
-            name: torch.cat(rows)[back] if rows else self._nothing(name)
-            for name, rows in pieces.items()
-        }
-        if "part" in out:
-            part = out["part"].long()
-            out["part"] = torch.where(part == UNLABELLED, -1, part)
-        out["index"] = torch.from_numpy(index)
-        return out
+            rows = np.flatnonzero(shard_of == shard)
+            local = index[rows] - self.split.manifest.shards[shard].first
+            # numpy copies in this thread; torch would wake its others for each small tensor.
+            for name, array in self._shard(int(shard)).items():
+                out[name][rows] = array[local]
+        batch = {name: torch.from_numpy(array) for name, array in out.items()}
+        if "part" in batch:
+            part = batch["part"].long()
+            batch["part"] = torch.where(part == UNLABELLED, -1, part)
+        batch["index"] = torch.from_numpy(index)
+        return batch
 
-    def _nothing(self, name: str) -> Tensor:
-        """A tensor of no samples."""
-        kind = LAYOUT[name][0] if name in LAYOUT else "float32"
-        return torch.zeros(self.split.shapes(0).get(name, (0,)), dtype=getattr(torch, kind))
+    def _room(self, name: str, count: int) -> np.ndarray:
+        """Zeros for `count` samples of a tensor; one that CONTRACT 3 lacks is as in shard 0."""
+        if name in LAYOUT:
+            return np.zeros(self.split.shapes(count)[name], LAYOUT[name][0])
+        if not self.split.manifest.shards:
+            return np.zeros(count, np.float32)
+        like = self._shard(0)[name]
+        return np.zeros((count, *like.shape[1:]), like.dtype)
 
     def _inside(self, indices: Tensor) -> np.ndarray:
         """The indices from 0 on."""
@@ -107,21 +108,22 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
             )
         return np.where(index < 0, index + len(self), index)
 
-    def _shard(self, number: int) -> dict[str, Tensor]:
+    def _shard(self, number: int) -> Arrays:
         """A shard's memory map, checked once per process."""
         if number not in self._open:
             shard = self.split.manifest.shards[number]
             path = self.split.folder / shard.file
             self.split.check_header(path, read_header(path, SAMPLES))
             try:
-                with safe_open(path, "pt") as file:
+                with safe_open(path, "pt") as file:  # the numpy reader copies
                     require(path, self.names, file.keys())
-                    tensors = {name: file.get_tensor(name) for name in self.names}
-            except (SafetensorError, OSError) as error:
-                raise StoreError(f"{path}: expected readable tensors, found {error}") from error
-            arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+                    arrays = {name: file.get_tensor(name).numpy() for name in self.names}
+            except (SafetensorError, TypeError, OSError) as error:
+                raise StoreError(
+                    f"{path}: expected numpy-readable tensors, found {error}"
+                ) from error
             check_samples(path, arrays, self.split.manifest, shard.first, shard.count)
-            self._open[number] = tensors
+            self._open[number] = arrays
         return self._open[number]
 
 

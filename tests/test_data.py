@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from splits import POINTS, edit_manifest, sample_arrays, write_split
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
@@ -191,6 +192,16 @@ def test_a_cut_shard_is_refused(folder: Path) -> None:
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(StoreError, match=r"00001.safetensors: expected a safetensors file"):
         store.dataset(folder)[3]
+
+
+def test_a_tensor_of_a_type_that_numpy_lacks_is_refused(folder: Path) -> None:
+    path = folder / "00000.safetensors"
+    tensors = load_file(path)
+    header = {"scapo": store.canonical_json(store.read_header(path))}
+    save_file({**tensors, "weight": torch.ones(3).bfloat16()}, path, header)
+    store.dataset(folder)[0]
+    with pytest.raises(StoreError, match=r"00000.safetensors: expected readable tensors"):
+        store.dataset(folder, names=("points", "weight"))[0]
 
 
 def test_observations_and_labels_of_a_batch(samples: SampleDataset) -> None:
