@@ -8,7 +8,9 @@ Where neither the caller nor the source says where the front is, it is told from
 - eyeglasses: from the temples' middles to their hinges;
 - basket: along the handles' hinges, so that these run along x (of the two ends the one nearer to
   the root link's -x or -y), whatever the source says;
-- scissors: z is the axis (on the side that is up), the blades run along x.
+- scissors: z is the axis (on the side that is up), the closed blades run along x with the tips at
+  +x, the rings towards the user; the first blade is the one from which the other opens by a turn
+  about -z, so that when they open the first tip is at +y.
 
 Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
 Left is what is left of one who looks out of the front, -y: the wearer's left of eyeglasses.
@@ -103,7 +105,8 @@ def blades(parts: Sequence[Float[np.ndarray, "_ 3"]], normal: Vector) -> Vector:
     """The direction of closed scissors' tips: halfway between those of the two blades.
 
     The tips' end of the long side of the smallest rectangle about the pair is the narrower one:
-    rings stand further apart than blades. Each blade points from the pivot to the middle of its far end there.
+    rings stand further apart than blades. Each blade points from the pivot to the middle of its
+    far end there.
 
     Args:
         parts: Vertices of the two parts, the origin on the axis.

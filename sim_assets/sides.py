@@ -59,9 +59,10 @@ def _weld(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
 def _shells(
     faces: Int[np.ndarray, "F 3"],
 ) -> tuple[Int[np.ndarray, " F"], Bool[np.ndarray, " S"]]:
-    """The shell of each face, joined over shared edges, and whether each shell is closed.
+    """The shell of each face, and whether each shell is closed.
 
-    Closed: every edge is run through exactly once in each direction.
+    Faces are joined over edges that two of them share: shells that only touch along an edge stay
+    apart. Closed: the shell runs through each of its edges as often one way as the other.
     """
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     owner = np.repeat(np.arange(len(faces)), 3)
@@ -69,14 +70,16 @@ def _shells(
     low, high = np.minimum(start, end), np.maximum(start, end)
     _, edge, uses = np.unique(low * many + high, return_inverse=True, return_counts=True)
     edge = edge.reshape(-1)
+    joins = uses[edge] == 2
     links = coo_array(
-        (np.ones(len(edge)), (owner, len(faces) + edge)), shape=(len(faces) + len(uses),) * 2
+        (np.ones(joins.sum()), (owner[joins], len(faces) + edge[joins])),
+        shape=(len(faces) + len(uses),) * 2,
     )
     count, label = connected_components(links, directed=False)
     shell = label[: len(faces)]
-    forward = np.bincount(edge, start < end, minlength=len(uses))
-    good = (uses == 2) & (forward == 1)
-    broken = np.bincount(shell[owner], ~good[edge], minlength=count)
+    place = np.unique(shell[owner] * len(uses) + edge, return_inverse=True)
+    balance = np.bincount(place[1].reshape(-1), np.where(start < end, 1.0, -1.0))
+    broken = np.bincount(place[0] // max(len(uses), 1), balance != 0, minlength=count)
     return shell, broken == 0
 
 
