@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from bench.compat_chain import Chain, inverse_chain, straight_chain
 from bench.compat_eap import eap_calibration, eap_iou, eap_rotation
 from bench.matching import nearest_orthogonal, project_rotations, rotation_degrees
+from bench.metrics import unit
 from bench.ordering import order_scores, part_orders
 
 __all__ = [
@@ -194,8 +195,7 @@ def _score(
     """PROTOCOL 1.3 to 1.5 in the published reading."""
     true_pose, true_joint, label, known = _reorder(record)
     expand = _float(record["expand"])[:, None] if _scaled(record) else 1.0
-    axis = true_joint[..., 3:] / np.linalg.norm(true_joint[..., 3:], axis=-1, keepdims=True)
-    pred_axis = joints[1] / np.linalg.norm(joints[1], axis=-1, keepdims=True)
+    axis, pred_axis = unit(true_joint[..., 3:]), unit(joints[1])
     offset = joints[0] - true_joint[..., :3]
     sine = np.linalg.norm(np.cross(axis, pred_axis), axis=-1)
     return {

@@ -27,7 +27,7 @@ TRANSLATION_INLIER = 0.25
 def reorder_poses(
     camera_T_part: Float[np.ndarray, "B P 4 4"],
     order: Int[np.ndarray, "B P"],
-    symmetry: Num[np.ndarray, "3 3"] | None,
+    symmetry: np.ndarray | None,
 ) -> Float[np.ndarray, "B P 4 4"]:
     """True poses by slot; rotations of swapped samples times `symmetry` from the right."""
     poses = np.take_along_axis(camera_T_part, order[..., None, None], 1).astype(np.float64)
@@ -64,7 +64,7 @@ def project_rotations(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, 
 
 
 def rotation_degrees(
-    a: Float[np.ndarray, "*B 3 3"], b: Float[np.ndarray, "*B 3 3"]
+    a: Float[np.ndarray, "*#B 3 3"], b: Float[np.ndarray, "*#B 3 3"]
 ) -> Float[np.ndarray, "*B"]:
     """Angle of a b^T in degrees by atan2, exact near 0 and near 180."""
     relative = a @ np.swapaxes(b, -1, -2)

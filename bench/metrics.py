@@ -103,7 +103,7 @@ def sample_errors(  # noqa: PLR0913
     agreement = agree(
         np.asarray(part_true), np.asarray(part_pred), parts, label_order=label_order, iou=iou
     )
-    poses = reorder_poses(camera_T_part_true, agreement.order, symmetry)
+    poses = reorder_poses(np.asarray(camera_T_part_true), agreement.order, symmetry)
     turn, shift = pose_errors(poses, camera_T_part_pred, rotation)
     direction, distance = joint_errors(
         reorder_joints(np.asarray(pivot_true), agreement.order),

@@ -19,7 +19,7 @@ def average_precision(
     part_translation: np.ndarray,
     joint_direction: np.ndarray,
     joint_pivot: np.ndarray,
-    rule: ApRule = "mean",
+    rule: str = "mean",
 ) -> dict[str, float]:
     """Shares of Table 2 (PROTOCOL 1.8): IoU over 75 and 50 %, errors under k degrees and k cm.
 
@@ -58,7 +58,7 @@ def precision_passes(
     part_translation: np.ndarray,
     joint_direction: np.ndarray,
     joint_pivot: np.ndarray,
-    rule: ApRule = "mean",
+    rule: str = "mean",
 ) -> dict[str, np.ndarray]:
     """What `average_precision` counts: bool (B,), or (B, P) and (B, J) for `per-part`."""
     rule_name = rule.replace("_", "-")
