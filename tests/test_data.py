@@ -200,7 +200,7 @@ def test_a_tensor_of_a_type_that_numpy_lacks_is_refused(folder: Path) -> None:
     header = {"scapo": store.canonical_json(store.read_header(path))}
     save_file({**tensors, "weight": torch.ones(3).bfloat16()}, path, header)
     store.dataset(folder)[0]
-    with pytest.raises(StoreError, match=r"00000.safetensors: expected readable tensors"):
+    with pytest.raises(StoreError, match=r"00000.safetensors: expected numpy-readable tensors"):
         store.dataset(folder, names=("points", "weight"))[0]
 
 
