@@ -16,7 +16,17 @@ from typing import Any
 import numpy as np
 
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.procedural import drawer, eyeglasses, laptop, oven, safe, scissors, suitcase, washer
+from sim_assets.procedural import (
+    basket,
+    drawer,
+    eyeglasses,
+    laptop,
+    oven,
+    safe,
+    scissors,
+    suitcase,
+    washer,
+)
 from sim_assets.procedural.assembly import VERSION, Recipe, assemble, digest
 from sim_assets.procedural.parameters import draw
 
@@ -32,6 +42,7 @@ RECIPES: dict[str, Recipe] = {
     "suitcase": suitcase.RECIPE,
     "scissors": scissors.RECIPE,
     "eyeglasses": eyeglasses.RECIPE,
+    "basket": basket.RECIPE,
 }
 
 
