@@ -75,11 +75,12 @@ def _shells(
         (np.ones(joins.sum()), (owner[joins], len(faces) + edge[joins])),
         shape=(len(faces) + len(uses),) * 2,
     )
-    count, label = connected_components(links, directed=False)
-    shell = label[: len(faces)]
+    label = connected_components(links, directed=False)[1][: len(faces)]
+    names, shell = np.unique(label, return_inverse=True)
+    shell = shell.reshape(-1)
     place = np.unique(shell[owner] * len(uses) + edge, return_inverse=True)
     balance = np.bincount(place[1].reshape(-1), np.where(start < end, 1.0, -1.0))
-    broken = np.bincount(place[0] // max(len(uses), 1), balance != 0, minlength=count)
+    broken = np.bincount(place[0] // max(len(uses), 1), balance != 0, minlength=len(names))
     return shell, broken == 0
 
 

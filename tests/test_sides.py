@@ -65,6 +65,17 @@ def test_closed_shells_are_kept_and_turned_outward():
     assert mesh.volume == pytest.approx(box.volume + far.volume)
 
 
+@pytest.mark.parametrize("inverted", [False, True])
+def test_shells_that_touch_along_an_edge_are_told_apart(inverted: bool):
+    one = trimesh.creation.box((1, 1, 1))
+    two = one.copy().apply_translation((1, 1, 0))
+    faces = np.concatenate([one.faces, (two.faces[:, ::-1] if inverted else two.faces) + 8])
+    vertices = np.concatenate([one.vertices, two.vertices])
+    result = two_sided(vertices, faces)
+    assert len(result) == 24
+    assert trimesh.Trimesh(vertices, result, process=False).volume == pytest.approx(2)
+
+
 def test_unmerged_vertices_count_as_one():
     box = trimesh.creation.box((1, 1, 1))
     soup = box.triangles.reshape(-1, 3)
