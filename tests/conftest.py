@@ -7,6 +7,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The same examples each time, and no clock: a busy machine is no failure.
+settings.register_profile("scapo", deadline=None, derandomize=True)
+settings.load_profile("scapo")
 
 # One thread each, set before numpy and torch are imported: tests run in one process per core.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LP_NUM_THREADS"):
