@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """How deep the parts of an object reach into one another, in any state.
 
-A point is inside a part if its winding number about one of the part's closed surfaces is not zero
-(Jacobson et al. 2013, robust for several overlapping shells); its depth is its distance from that
-surface.
+A point is inside a part if one of the part's closed surfaces winds about it, which holds for
+surfaces made of several overlapping shells too; its depth is its distance from that surface.
 """
 
 from __future__ import annotations
@@ -20,26 +19,36 @@ from sim_assets.articulated import ArticulatedObject
 
 _CHUNK = 2_000_000
 """Point-triangle pairs handled at once."""
+_GENERIC = trimesh.transformations.euler_matrix(0.7371, 0.4219, 1.2377)[:3, :3]
+"""A rotation whose third row is parallel to nothing that is built."""
 
 
 def winding_number(
     points: Float[np.ndarray, "N 3"], mesh: trimesh.Trimesh
 ) -> Float[np.ndarray, " N"]:
-    """Turns of the closed surface about each point: 1 inside, 0 outside (van Oosterom 1983)."""
+    """Turns of the closed surface about each point: 1 inside, 0 outside.
+
+    Counted as the surface's signed crossings with a ray from the point, in one direction that no
+    edge of a built shape is parallel to.
+    """
+    corners = np.asarray(mesh.triangles) @ _GENERIC.T  # (F, 3, 3), the ray along its z
+    points = points @ _GENERIC.T
+    a, b, c = (corners[:, k] for k in range(3))
+    normal = np.cross(b - a, c - a)
     total = np.zeros(len(points))
-    step = max(1, _CHUNK // len(mesh.faces))
-    corners = np.asarray(mesh.triangles)
+    step = max(1, _CHUNK // len(corners))
     for start in range(0, len(points), step):
-        a, b, c = np.moveaxis(corners[None] - points[start : start + step, None, None], 2, 0)
-        length_a, length_b, length_c = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
-        volume = np.einsum("nfi,nfi->nf", a, np.cross(b, c))
-        base = (
-            length_a * length_b * length_c
-            + np.einsum("nfi,nfi->nf", a, b) * length_c
-            + np.einsum("nfi,nfi->nf", b, c) * length_a
-            + np.einsum("nfi,nfi->nf", c, a) * length_b
-        )
-        total[start : start + step] = np.arctan2(volume, base).sum(1) / (2 * np.pi)
+        p = points[start : start + step, None]
+        sides = [
+            (v[:, 0] - u[:, 0]) * (p[..., 1] - u[:, 1])
+            - (v[:, 1] - u[:, 1]) * (p[..., 0] - u[:, 0])
+            for u, v in ((a, b), (b, c), (c, a))
+        ]
+        facing = np.sign(normal[:, 2])
+        covered = np.logical_and.reduce([side * facing > 0 for side in sides])
+        which, face = np.nonzero(covered)
+        above = ((a[face] - p[which, 0]) * normal[face]).sum(-1) * facing[face] > 0
+        np.add.at(total, start + which[above], facing[face[above]])
     return total
 
 
@@ -59,7 +68,7 @@ def depth_inside(points: Float[np.ndarray, "N 3"], mesh: trimesh.Trimesh, ignore
 def probes(mesh: trimesh.Trimesh, count: int) -> Float[np.ndarray, "N 3"]:
     """Points to test: vertices, middles of edges, and `count` points spread over the area."""
     corners = np.asarray(mesh.triangles)
-    middles = (corners + np.roll(corners, -1, axis=1)).reshape(-1, 3) / 2
+    middles = np.asarray(mesh.vertices)[mesh.edges_unique].mean(1)
     rng = np.random.Generator(np.random.PCG64(0))
     areas = np.maximum(mesh.area_faces, 1e-15)
     chosen = rng.choice(len(corners), count, p=areas / areas.sum())
