@@ -34,6 +34,8 @@ ONE_THREAD = (
 """Thread counts set to 1 in workers: of BLAS and OpenMP, and of Mesa's CPU renderer."""
 TICK = 0.5
 """Seconds between looks at the clock."""
+START = 120.0
+"""Seconds that a worker may take to start and to import what it needs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +56,7 @@ class _Worker:
     pipe: Connection
     job: Any = None
     busy: bool = False
+    begun: bool = False
     label: str = ""
     heard: float = 0.0
 
@@ -113,7 +116,7 @@ class Pool(Generic[Job, Result]):
                 self._drop(worker)
                 continue
             worker.job, worker.label = waiting.popleft(), ""
-            worker.busy, worker.heard = True, time.monotonic()
+            worker.busy, worker.begun, worker.heard = True, False, time.monotonic()
 
     def _start(self) -> _Worker:
         context = get_context("spawn")
@@ -137,7 +140,9 @@ class Pool(Generic[Job, Result]):
             while ready and worker.pipe.poll():
                 kind, *content = worker.pipe.recv()
                 worker.heard = time.monotonic()
-                if kind == "report":
+                if kind == "begun":
+                    worker.begun = True
+                elif kind == "report":
                     worker.label = content[0]
                     if on_report is not None:
                         on_report(worker.job, *content)
@@ -148,9 +153,10 @@ class Pool(Generic[Job, Result]):
             worker.process.join(timeout=5)  # so that its exit code is known
             self._drop(worker)
             return _outcome(worker, None, "died", _cause(worker.process.exitcode))
-        if time.monotonic() - worker.heard > self.timeout:
+        limit = self.timeout if worker.begun else max(self.timeout, START)
+        if time.monotonic() - worker.heard > limit:
             self._drop(worker)
-            reason = f"no sign of life for {self.timeout:g} s"
+            reason = f"no sign of life for {limit:g} s"
             return _outcome(worker, None, "hung", reason)
         return None
 
@@ -210,6 +216,7 @@ def _work(pipe: Connection) -> None:
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):  # the parent is gone
         while True:
             function, job = pipe.recv()
+            pipe.send(("begun",))
             try:
                 message = ("result", function(job, report), "")
             except (BrokenPipeError, ConnectionResetError):

@@ -30,8 +30,13 @@ from tests.boxes import laptop
 pytestmark = pytest.mark.render
 
 CAMERA = Intrinsics.from_fov(np.radians(60), 256, 256)
-REAL = {"oven": "oven", "eyeglasses": "eyeglasses", "laptop": "laptop", "storage": "drawer",
-        "scissors": "scissors"}
+REAL = {
+    "oven": "oven",
+    "eyeglasses": "eyeglasses",
+    "laptop": "laptop",
+    "storage": "drawer",
+    "scissors": "scissors",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -95,9 +100,7 @@ def test_sapien_agrees_with_ray_casting(category, sapien_renderer, caster):
 
 
 @pytest.mark.parametrize("folder", REAL)
-def test_sapien_agrees_with_ray_casting_on_real_models(
-    folder, shared_dir, sapien_renderer, caster
-):
+def test_sapien_agrees_with_ray_casting_on_real_models(folder, shared_dir, sapien_renderer, caster):
     results = []
     for urdf in find(shared_dir / "assets" / folder)[:3]:
         thing = read(urdf, REAL[folder], root=shared_dir / "assets" / folder)

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: MIT
+"""Worker processes that fail, die and hang."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from scapo.jobs import ONE_THREAD, Pool, describe_error
+
+
+def act(job: tuple[str, int], report) -> object:
+    """What the workers do here."""
+    verb, number = job
+    report(f"{verb} {number}", 1)
+    if verb == "raise":
+        raise ValueError(f"number {number}:\n expected less")
+    if verb == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if verb == "exit":
+        os._exit(7)
+    if verb == "hang":
+        time.sleep(600)
+    if verb == "tick":
+        for _ in range(8):
+            time.sleep(0.25)
+            report("tick", 0)
+    if verb == "environment":
+        return {name: os.environ.get(name) for name in ONE_THREAD}
+    return number**2
+
+
+def test_a_job_that_fails_dies_or_hangs_costs_that_job_only():
+    jobs = [
+        ("square", 1),
+        ("raise", 2),
+        ("die", 3),
+        ("hang", 4),
+        ("exit", 5),
+        ("tick", 6),
+        ("environment", 7),
+        ("square", 8),
+    ]
+    heard: list[tuple[str, int]] = []
+    with Pool(2, timeout=1.5) as pool:
+        outcomes = {
+            outcome.job: outcome
+            for outcome in pool.run(act, jobs, lambda job, label, n: heard.append((label, n)))
+        }
+        after = [outcome.result for outcome in pool.run(act, [("square", 9)])]
+    assert after == [81]
+    assert set(outcomes) == set(jobs)
+    assert [outcomes["square", n].result for n in (1, 8)] == [1, 64]
+    assert outcomes["tick", 6].result == 36  # two seconds, but with signs of life
+    failures = {job: (o.failure, o.reason, o.label) for job, o in outcomes.items() if o.failure}
+    assert failures == {
+        ("raise", 2): ("error", "number 2: expected less", "raise 2"),
+        ("die", 3): ("died", "its process was ended by SIGKILL", "die 3"),
+        ("hang", 4): ("hung", "no sign of life for 1.5 s", "hang 4"),
+        ("exit", 5): ("died", "its process ended with exit code 7", "exit 5"),
+    }
+    assert outcomes["environment", 7].result == dict.fromkeys(ONE_THREAD, "1")
+    assert ("square 1", 1) in heard
+
+
+def test_workers_end_with_the_pool():
+    with Pool(1) as pool:
+        (outcome,) = pool.run(act, [("square", 3)])
+        process = pool._workers[0].process
+        assert process.is_alive()
+    assert outcome.result == 9
+    assert not process.is_alive()
+
+
+def test_no_jobs_start_no_process():
+    with Pool(2) as pool:
+        assert list(pool.run(act, [])) == []
+        assert pool._workers == []
+
+
+def test_a_pool_needs_a_worker():
+    with pytest.raises(ValueError, match="workers: expected 1 or more, found 0"):
+        Pool(0)
+
+
+def test_errors_in_one_line():
+    assert describe_error(ValueError("a:\n  b")) == "a: b"
+    assert describe_error(ZeroDivisionError("division by zero")) == (
+        "ZeroDivisionError: division by zero"
+    )
+    assert describe_error(KeyError("x")) == "KeyError: 'x'"
+    assert describe_error(MemoryError()) == "MemoryError"
+    assert describe_error(OSError(28, "No space left on device")) == (
+        "[Errno 28] No space left on device"
+    )
