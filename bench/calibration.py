@@ -59,9 +59,9 @@ class Fitted:
 
 def _plain(values: np.ndarray) -> Any:  # noqa: ANN401
     """Nested lists, NaN as None."""
-    if values.ndim:
+    if values.ndim > 1:
         return [_plain(value) for value in values]
-    return float(values) if np.isfinite(values) else None
+    return [value if value == value else None for value in values.tolist()]
 
 
 def check_calibration(path: Path, header: Header, tested: Header) -> None:

@@ -221,7 +221,7 @@ def state_errors(
     state_true: Float[np.ndarray, "B J"],
     state_pred: Float[np.ndarray, "B J"],
     revolute: np.ndarray,
-    offset: Float[np.ndarray, " J"],
+    offset: Float[np.ndarray, "*#B J"],
     sign: Float[np.ndarray, "B J"],
 ) -> Float[np.ndarray, "B J"]:
     """|s phi + offset - theta| (PROTOCOL 1.9), radians (around the circle) or a length.

@@ -166,15 +166,15 @@ def truth_as_prediction(split: Split, *, weights: bool = False) -> Arrays:
     return {"part_weight": one_hot, **arrays}
 
 
-def header_of(split: Split, **changes: Any) -> Header:
+def header_of(made_on: Split, /, **changes: Any) -> Header:
     """A valid header for predictions on `split`."""
     fields: dict[str, Any] = {
         "method": "made",
         "variant": "",
-        "category": split.manifest.category,
-        "split": split.manifest.split,
+        "category": made_on.manifest.category,
+        "split": made_on.manifest.split,
         "seed": 1,
-        "data_digest": split.manifest.digest,
+        "data_digest": made_on.manifest.digest,
         "supervision": (),
     }
     return Header(**(fields | changes))

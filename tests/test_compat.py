@@ -183,7 +183,7 @@ def test_the_released_code_evaluates_the_base_as_third_part():
 def test_a_record_must_be_whole():
     record = perfect_record(3, 2, "r")
     del record["S_angl"]
-    with pytest.raises(ValueError, match="record: expected R_select, .*, found no S_angl"):
+    with pytest.raises(ValueError, match=r"record: expected R_select, .*, found no S_angl"):
         compat.opalign(record)
 
 
