@@ -119,7 +119,9 @@ def _impossible(name: str, array: np.ndarray, manifest: Manifest) -> tuple[str, 
     if name == "instance":
         top = len(manifest.instances)
         return f"an index below {top}", (array < 0) | (array >= top)
-    if name == "visible":  # not every data set knows it
+    if name == "joint_state":  # scans of real objects have no rest to count it from
+        return "a finite number, or NaN", np.isinf(array)
+    if name == "visible":  # nor the surface that is not seen
         return "a share between 0 and 1, or NaN", (array < 0) | (array > 1 + TOLERANCE)
     if name == "joint_axis":
         with np.errstate(over="ignore"):
@@ -141,4 +143,5 @@ def _is_rigid(pose: np.ndarray) -> np.ndarray:
     rotation = pose[..., :3, :3]
     gap = rotation @ rotation.swapaxes(-1, -2) - np.eye(3)
     proper = (abs(gap) < TOLERANCE).all((-1, -2)) & (np.linalg.det(rotation) > 0)
-    return finite & proper & (pose[..., 3, :] == [0, 0, 0, 1]).all(-1)
+    last = (abs(pose[..., 3, :] - np.array([0, 0, 0, 1])) < TOLERANCE).all(-1)
+    return finite & proper & last

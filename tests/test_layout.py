@@ -53,7 +53,7 @@ def test_the_layout_is_that_of_the_contract(manifest: Manifest) -> None:
 def test_possible_samples_pass(manifest: Manifest) -> None:
     arrays = sample_arrays("eyeglasses", 4, 0)
     arrays["visible"][0, 0] = np.nan  # unknown
-    arrays["joint_state"][0, 0] = -0.1
+    arrays["joint_state"][0] = -0.1, np.nan
     arrays["mine"] = np.full((2, 2), np.nan)  # of somebody's own
     check_samples(PATH, arrays, manifest, 10, 4)
     check_samples(PATH, {name: array[:0] for name, array in arrays.items()}, manifest, 10, 0)
@@ -77,7 +77,7 @@ IMPOSSIBLE = [
     (put("joint_axis", (1, 1), np.nan), "expected a unit vector, found [nan, nan, nan]"),
     (put("joint_axis", (1, 1), 3e38), "expected a unit vector"),
     (put("joint_pivot", (0, 0, 2), np.nan), "'joint_pivot', sample 10[0][2]: expected a finite"),
-    (put("joint_state", (0, 1), np.nan), "'joint_state', sample 10[1]: expected a finite number"),
+    (put("joint_state", (0, 1), np.inf), "'joint_state', sample 10[1]: expected a finite number"),
     (put("camera_T_part", (1, 2, 0, 0), 7), "'camera_T_part', sample 11[2]: expected a rigid"),
     (put("camera_T_part", (1, 2), 0), "'camera_T_part', sample 11[2]: expected a rigid motion"),
     (put("camera_T_part", (1, 2), np.diag([1, 1, -1, 1])), "expected a rigid motion"),
