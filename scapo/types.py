@@ -75,7 +75,8 @@ class Joints:
     axis: Float[Tensor, "*B J 3"]
     """Unit vector, right-hand rule."""
     state: Float[Tensor, "*B J"]
-    """rad or m, child minus parent, 0 at rest and >= 0 towards open."""
+    """rad or m, child minus parent, 0 at rest and >= 0 towards open; NaN where a data set does
+    not know it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -219,3 +219,15 @@ def test_no_matrix_is_kept_for_the_backward_pass(function: Distance) -> None:
         sizes.clear()
         full_chamfer(a, b)
         assert max(sizes) >= 300 * 200  # the count above would notice one
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_neighbours_and_distances_on_a_gpu_are_those_of_the_cpu() -> None:
+    a, b = pair(11, 3, dtype=torch.float32, centre=CENTRES[1])
+    on_gpu = (a.cuda(), b.cuda())
+    assert torch.equal(cloud.nearest(*on_gpu).cpu(), cloud.nearest(a, b))
+    with torch.autocast("cuda", dtype=torch.bfloat16):
+        assert torch.equal(cloud.k_nearest(*on_gpu, 5).cpu(), cloud.k_nearest(a, b, 5))
+    assert_close(cloud.chamfer(*on_gpu).cpu(), cloud.chamfer(a, b))
+    assert torch.equal(cloud.farthest_points(on_gpu[0], 9).cpu(), cloud.farthest_points(a, 9))
