@@ -7,13 +7,14 @@ Frames: `aligned` is the paper's S_obj, `template` its Y_X. Lengths are in norma
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from scapo.types import Category
+from scapo.types import Category, JointKind
 from scapo.vector_neurons import uniform
 
 
@@ -40,13 +41,20 @@ class JointConfig:
     blocks: int = 5
     head: tuple[int, int] = (256, 128)
     points: int | None = None
-    """Points it looks at, the first of the cloud; None = all."""
+    """Points it looks at, evenly taken from the cloud's order; None = all."""
     revolute_range: float = 2.0944
     """Width of the interval of states, rad (120 degrees)."""
     prismatic_range: float = 1.0
     """The same for prismatic joints, in normalised units."""
     base_fixed: bool = True
     """Hold the parent's state at 0: moving the base is the same as moving the object."""
+
+
+def thin(points: Float[Tensor, "B N 3"], count: int) -> Float[Tensor, "B {count} 3"]:
+    """`count` of the points, evenly taken from their order."""
+    if count >= points.shape[1]:
+        return points
+    return points[:, torch.arange(count, device=points.device) * points.shape[1] // count]
 
 
 class ResidualBlock(nn.Module):
@@ -71,7 +79,7 @@ class JointNetwork(nn.Module):
     def __init__(self, config: JointConfig, category: Category) -> None:
         super().__init__()
         self.config = config
-        self.kinds = tuple(joint.kind for joint in category.joints)
+        self.kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         width, (wide, narrow) = config.width, config.head
         self.lift = nn.Linear(3, 2 * width)
         self.blocks = nn.ModuleList([ResidualBlock(2 * width, width) for _ in range(config.blocks)])
@@ -83,9 +91,24 @@ class JointNetwork(nn.Module):
             nn.Linear(narrow, 8 * len(self.kinds)),
         )
 
+    def pair(
+        self, aligned: Float[Tensor, "B N 3"], template: Float[Tensor, "B M 3"]
+    ) -> tuple[JointPairs, JointPairs]:
+        """Joints of both shapes, as one batch so that they share its statistics (OP-Align)."""
+        count = min(aligned.shape[1], template.shape[1], self.config.points or 1 << 30)
+        both = torch.cat([thin(aligned, count), thin(template, count)])
+        joints = self(both)
+        first, second = (
+            JointPairs(pivot=pivot, axis=axis, state=state)
+            for pivot, axis, state in zip(
+                joints.pivot.chunk(2), joints.axis.chunk(2), joints.state.chunk(2), strict=True
+            )
+        )
+        return first, second
+
     def forward(self, points: Float[Tensor, "B N 3"]) -> JointPairs:
-        """Joints in the frame of the points; states uniform over the range by a sigmoid."""
-        x = self.lift(points[:, : self.config.points])
+        """Joints in the frame of the points; states within half the range of 0 by a sigmoid."""
+        x = self.lift(points)
         for block in self.blocks[:-1]:
             x = block(x)
             x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
@@ -116,7 +139,7 @@ class KeypointNetwork(nn.Module):
         super().__init__()
         sizes = (code, *config.keypoint)
         layers: list[nn.Module] = []
-        for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+        for inputs, outputs in pairwise(sizes):
             layers += [nn.Linear(inputs, outputs), nn.ReLU()]
         self.layers = nn.Sequential(*layers)
         self.out = nn.Linear(sizes[-1], 3 * parts)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -57,6 +57,8 @@ class AbstractMethod(nn.Module, ABC):
     """
 
     name: ClassVar[str]
+    config: Any
+    """A frozen dataclass; stored in checkpoints."""
     category: Category
     supervision: frozenset[Supervision]
 

@@ -76,6 +76,26 @@ class VNLinear(nn.Module):
         return F.linear(x, self.rows())
 
 
+class VectorScale(nn.Module):
+    """Learned gain over the root mean square length of each channel, running mean for eval."""
+
+    mean_square: Tensor
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(channels))
+        self.register_buffer("mean_square", torch.ones(channels))
+
+    def forward(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, " C"]:
+        """The factor of each channel."""
+        if not self.training:
+            return self.gain * (self.mean_square + TINY).rsqrt()
+        mean_square = 3 * x.flatten(0, -2).square().mean(0)
+        with torch.no_grad():
+            self.mean_square.lerp_(mean_square.detach(), 0.1)
+        return self.gain * (mean_square + TINY).rsqrt()
+
+
 class VNBatchNorm(nn.Module):
     """Batch norm of the vectors' lengths; directions stay.
 
@@ -86,34 +106,21 @@ class VNBatchNorm(nn.Module):
     with a translation.
     """
 
-    mean_square: Tensor
-
     def __init__(self, channels: int, *, affine: bool = False, form: NormForm = "scale") -> None:
         super().__init__()
         self.affine = affine
-        self.norm = nn.BatchNorm1d(channels) if form == "length" else None
-        self.gain = nn.Parameter(torch.ones(channels)) if form == "scale" else None
-        self.register_buffer("mean_square", torch.ones(channels))
+        self.norm = nn.BatchNorm1d(channels) if form == "length" else VectorScale(channels)
 
     def forward(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, "*B 3 C"]:
         """Same shape; equivariant in eval mode, in training mode up to the batch's statistics."""
         centre = x.mean(-1, keepdim=True) if self.affine else None
         x = x if centre is None else x - centre
-        x = x * self.factor(x)
-        return x if centre is None else x + centre
-
-    def factor(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, "*#B #3 C"]:
-        """By which each vector's length changes."""
-        if self.norm is not None:
-            length = (x.square().sum(-2) + TINY).sqrt()  # (..., C)
-            return (self.norm(length.flatten(0, -2)).view_as(length) / length)[..., None, :]
-        if self.training:
-            mean_square = 3 * x.flatten(0, -2).square().mean(0)
-            with torch.no_grad():
-                self.mean_square.lerp_(mean_square.detach(), 0.1)
+        if isinstance(self.norm, VectorScale):
+            x = x * self.norm(x)
         else:
-            mean_square = self.mean_square
-        return self.gain * (mean_square + TINY).rsqrt()
+            length = (x.square().sum(-2) + TINY).sqrt()  # (..., C)
+            x = x * (self.norm(length.flatten(0, -2)).view_as(length) / length)[..., None, :]
+        return x if centre is None else x + centre
 
 
 def rectify(
@@ -152,16 +159,17 @@ class VNBlock(nn.Module):
 def spread_centres(
     points: Float[Tensor, "B N 3"], count: int, pool: int
 ) -> Int[Tensor, "B {count}"]:
-    """Indices of well-spread points: farthest-point sampling among the first `pool` points.
+    """Indices of well-spread points: farthest-point sampling among `pool` of the cloud's points.
 
-    Starts from the point farthest from the centroid, so the choice does not depend on the order
-    of the pool and turns with the cloud.
+    The pool is evenly taken from the order of the points. Starts from the point farthest from the
+    centroid, so the choice does not depend on the order of the pool and turns with the cloud.
     """
-    pool = max(count, min(pool, points.shape[1]))
+    number = points.shape[1]
+    pool = max(count, min(pool, number))
+    candidate = torch.arange(pool, device=points.device) * number // pool
     centroid = points.mean(1, keepdim=True)
-    candidates = torch.cat([centroid, points[:, :pool]], 1)
-    chosen = farthest_points(candidates, count + 1)[:, 1:] - 1
-    return chosen.clamp(min=0)  # fewer different points than `count`: the first again
+    chosen = farthest_points(torch.cat([centroid, points[:, candidate]], 1), count + 1)[:, 1:]
+    return candidate[(chosen - 1).clamp(min=0)]  # fewer different points: the first again
 
 
 def edge_vectors(
