@@ -17,6 +17,8 @@ from jaxtyping import Float, Int
 Loop = Float[np.ndarray, "N 2"]
 """Counter-clockwise outline in a plane."""
 Ring = Float[np.ndarray, "N 3"]
+Numbers = Sequence[float] | np.ndarray
+"""A few coordinates or sizes."""
 
 FRONT = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """Object axes of a panel seen from the front (-x): its x to the viewer's right (-y), its y up
@@ -32,8 +34,8 @@ DOWN = np.diag([1.0, -1.0, -1.0])
 def rectangle(
     width: float,
     height: float,
-    radius: float | Sequence[float] = 0.0,
-    centre: Sequence[float] = (0.0, 0.0),
+    radius: float | Numbers = 0.0,
+    centre: Numbers = (0.0, 0.0),
     segments: int = 4,
 ) -> Loop:
     """A rectangle with rounded corners, 4 (segments + 1) points, counter-clockwise.
@@ -115,7 +117,7 @@ def loft(rings: Sequence[Ring], ring: bool = False) -> trimesh.Trimesh:
 def sweep(
     path: Float[np.ndarray, "K 3"],
     loop: Loop | Sequence[Loop],
-    up: Sequence[float],
+    up: Numbers,
     closed: bool = False,
 ) -> trimesh.Trimesh:
     """A profile carried along a path.
@@ -146,7 +148,7 @@ def sweep(
 
 def placed(
     mesh: trimesh.Trimesh,
-    translation: Sequence[float] = (0.0, 0.0, 0.0),
+    translation: Numbers = (0.0, 0.0, 0.0),
     rotation: Float[np.ndarray, "3 3"] | None = None,
 ) -> trimesh.Trimesh:
     """A copy, rotated and then moved."""
@@ -173,16 +175,14 @@ def merged(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
     )
 
 
-def bezier(
-    first: Sequence[float], corner: Sequence[float], last: Sequence[float], count: int
-) -> Ring:
+def bezier(first: Numbers, corner: Numbers, last: Numbers, count: int) -> Ring:
     """`count` points of the parabola from first to last, tangent to the lines to the corner."""
     t = np.linspace(0.0, 1.0, count)[:, None]
     ends = (1 - t) ** 2 * np.asarray(first) + t**2 * np.asarray(last)
     return ends + 2 * t * (1 - t) * np.asarray(corner)
 
 
-def resampled(loop: Loop, count: int) -> Loop:
+def resampled(loop: Loop, count: int) -> Float[np.ndarray, "{count} 2"]:
     """`count` points at equal distances along the loop."""
     closed = np.concatenate([loop, loop[:1]])
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])

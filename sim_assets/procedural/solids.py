@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import trimesh
 
-from sim_assets.procedural.shapes import Ring, at, loft, rectangle, superellipse
+from sim_assets.procedural.shapes import Numbers, Ring, at, loft, rectangle, superellipse
 
 
-def box(lower: Sequence[float], upper: Sequence[float]) -> trimesh.Trimesh:
+def box(lower: Numbers, upper: Numbers) -> trimesh.Trimesh:
     """An axis-aligned box from its two corners."""
     low, high = np.asarray(lower, float), np.asarray(upper, float)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -79,7 +79,7 @@ def cylinder(
     )
 
 
-def ellipsoid(size: Sequence[float], count: int = 16) -> trimesh.Trimesh:
+def ellipsoid(size: Numbers, count: int = 16) -> trimesh.Trimesh:
     """An ellipsoid with these full axes about the origin."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, count // 2 + 1)
     angle[[0, -1]] *= 0.985  # small flat poles in place of degenerate triangles
@@ -87,7 +87,7 @@ def ellipsoid(size: Sequence[float], count: int = 16) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices * np.asarray(size) / 2, mesh.faces, process=False)
 
 
-def tub(outer: Sequence[float], wall: float, floor: float, radius: float) -> trimesh.Trimesh:
+def tub(outer: Numbers, wall: float, floor: float, radius: float) -> trimesh.Trimesh:
     """An open box standing on z = 0 about the z axis.
 
     Args:
