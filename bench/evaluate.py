@@ -4,44 +4,23 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
 
-from bench.calibration import CALIBRATION_SPLIT, Fitted, check_calibration, dataset_order, fit
-from bench.compat_files import Canon, check_record, fit_canon, score_compat
-from bench.predictions import Header, Predictions, read_prediction_header
+from bench.compat_files import score_compat
+from bench.predictions import Header, Predictions
+from bench.prepare import Prepared, Request, fit_frames, open_data
 from bench.report import summarise
 from bench.score_files import Run, side_file, write_report, write_rows, writing
-from bench.scores import Errors, Frames, Rows, Settings, score
-from bench.truth import Truth, blocks, revolute, symmetry
-from scapo.store import Split, StoreError, open_split, sha256_file
+from bench.scores import Errors, Rows, Settings, score
+from bench.truth import Truth, blocks
+from scapo.store import Split, sha256_file
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
-    """What to score, how, and where the scores go."""
-
-    predictions: Path
-    data: Path
-    out: Path
-    split: str = "test"
-    calibration: Path | None = None
-    settings: Settings = field(default_factory=Settings)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Fit:
-    """What was learned of a method's frames before scoring."""
-
-    frames: Frames
-    order: Int[np.ndarray, " P"] | None = None
-    canon: Canon | None = None
-    record: dict[str, Any] | None = None
+__all__ = ["Request", "data_name", "evaluate", "run_of"]
 
 
 def evaluate(request: Request) -> dict[str, Any]:
@@ -52,16 +31,9 @@ def evaluate(request: Request) -> dict[str, Any]:
             expected and found.
     """
     side_file(request.out)
-    header = read_prediction_header(request.predictions)
-    if header.split != request.split:
-        raise StoreError(
-            f"{request.predictions}: header field 'split': expected "
-            f"{request.split!r}, found {header.split!r}"
-        )
-    split = open_split(request.data, header.category, request.split)
-    split.verify()
+    header, split = open_data(request)
     with Predictions(request.predictions, split) as predictions:
-        fitted = _fit(request, header, split, predictions)
+        fitted = fit_frames(request, header, split, predictions)
         scored = _Scored()
         run = run_of(request, header, split)
         with writing(request.out) as stream:
@@ -92,52 +64,11 @@ class _Scored:
         return {name: np.concatenate([block[name] for block in self.errors]) for name in names}
 
 
-def _errors(settings: Settings, fitted: _Fit, truth: Truth, rows: Rows) -> Errors:
+def _errors(settings: Settings, fitted: Prepared, truth: Truth, rows: Rows) -> Errors:
     errors = score(truth, rows, settings=settings, frames=fitted.frames, order=fitted.order)
     if fitted.canon is not None:
         errors |= score_compat(truth, rows, fitted.canon, fitted.frames)
     return errors
-
-
-def _fit(request: Request, header: Header, split: Split, predictions: Predictions) -> _Fit:
-    """Calibrate on the training split, where that was asked for."""
-    compat = request.settings.geometry == "opalign-compat"
-    if compat:
-        check_record(request.predictions, predictions.names)
-    frames = Frames(symmetry=symmetry(split.manifest), revolute=revolute(split.manifest))
-    if request.calibration is None:
-        if compat:
-            raise StoreError(
-                f"{request.predictions}: expected --calibration with predictions on "
-                f"the training split for --geometry opalign-compat, found none"
-            )
-        order = None
-        if request.settings.label_order == "dataset":
-            order = dataset_order(predictions, split)
-        return _Fit(frames=frames, order=order)
-    path = request.calibration
-    check_calibration(path, read_prediction_header(path), header)
-    train = open_split(request.data, header.category, CALIBRATION_SPLIT)
-    train.verify()
-    fitted = fit(path, train, settings=request.settings, frames=frames)
-    record = fitted.record() | {"sha256": sha256_file(path), "data": train.manifest.digest}
-    canon = None
-    if compat:
-        canon, facts = fit_canon(path, train, frames)
-        record["opalign"] = facts
-    return _Fit(
-        frames=_with_offsets(frames, fitted), order=fitted.order, canon=canon, record=record
-    )
-
-
-def _with_offsets(frames: Frames, fitted: Fitted) -> Frames:
-    offsets = None if fitted.poses is None else fitted.poses.offsets
-    return Frames(
-        symmetry=frames.symmetry,
-        revolute=frames.revolute,
-        offsets=offsets,
-        state_offset=fitted.state_offset,
-    )
 
 
 def run_of(request: Request, header: Header, split: Split) -> Run:
@@ -178,7 +109,7 @@ def _report(
     request: Request,
     header: Header,
     split: Split,
-    fitted: _Fit,
+    fitted: Prepared,
     scored: _Scored,
     predictions: Predictions,
 ) -> dict[str, Any]:

@@ -11,9 +11,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from bench.evaluate import Request, evaluate
+from bench.evaluate import evaluate
+from bench.explain import explain
 from bench.paper import check
 from bench.precision import ApRule
+from bench.prepare import Request
+from bench.reference import Kind, write_reference
 from bench.results import load
 from bench.score_files import side_file
 from bench.scores import Settings
@@ -91,8 +94,54 @@ class Tables:
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explain:
+    """Why a method fails: errors by what was seen, and with one piece replaced by the truth."""
+
+    predictions: Path
+    """Predictions (safetensors)."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    out: Path
+    """Folder for ladder.csv, ladder.png, strata.csv and strata.png."""
+    split: str = "test"
+    """Split that was predicted."""
+    calibration: Path | None = None
+    """Predictions of the same run on the training split, as for evaluate."""
+
+    def run(self, console: Console) -> None:
+        """Write the files and print their names."""
+        request = Request(predictions=self.predictions, data=self.data, out=self.out,
+                          split=self.split, calibration=self.calibration)  # fmt: skip
+        for path in explain(request):
+            console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reference:
+    """Write the predictions of a constant answer, or of one that is told the true base pose."""
+
+    kind: tyro.conf.Positional[Kind]
+    """Which of the two."""
+    data: Path
+    """Data set: the folder above CATEGORY/train and CATEGORY/SPLIT."""
+    category: str
+    """Category to predict."""
+    out: Path
+    """Predictions file (safetensors) for evaluate."""
+    split: str = "test"
+    """Split to predict."""
+
+    def run(self, console: Console) -> None:
+        """Write the file."""
+        write_reference(self.kind, self.data, self.category, self.out, split=self.split)
+        console.print(str(self.out), markup=False, highlight=False, soft_wrap=True)
+
+
 VERBS: dict[str, type] = {
     "evaluate": Evaluate,
     "tables": Tables,
+    "explain": Explain,
+    "reference": Reference,
 }
 """In the order of the help."""

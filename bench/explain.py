@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""Why a method fails: its errors by what was seen, and its oracle ladder, as CSV and plots."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from bench.explain_plots import plot_ladder, plot_strata
+from bench.ladder import RUNGS, Rung, climb
+from bench.predictions import Predictions
+from bench.prepare import Request, fit_frames, open_data
+from bench.scores import Errors
+from bench.statistics import Interval, interval
+from bench.strata import Stratum, factors, stratify
+from bench.truth import blocks
+from scapo.store import write_bytes
+
+STRATA_COLUMNS = ("factor", "lower", "upper", "metric", "unit", "samples", "mean", "low", "high",
+                  "n", "undefined")  # fmt: skip
+LADDER_COLUMNS = ("rung", "metric", "unit", "mean", "low", "high", "n", "undefined")
+
+
+def explain(request: Request) -> list[Path]:
+    """Write `strata.{csv,png}` and `ladder.{csv,png}` to the folder `request.out`.
+
+    Raises:
+        StoreError: As `evaluate`.
+    """
+    header, split = open_data(request)
+    rungs: dict[Rung, list[Errors]] = {rung: [] for rung in RUNGS}
+    seen: list[dict[str, np.ndarray]] = []
+    instances: list[np.ndarray] = []
+    with Predictions(request.predictions, split) as predictions:
+        fitted = fit_frames(request, header, split, predictions)
+        for truth in blocks(split):
+            rows = predictions.rows(truth.first, len(truth))
+            climbed = climb(truth, rows, settings=request.settings, frames=fitted.frames,
+                            order=fitted.order)  # fmt: skip
+            for rung, errors in climbed.items():
+                rungs[rung].append(errors)
+            seen.append(factors(truth, split.manifest))
+            instances.append(truth.instance)
+        predictions.finish()
+    instance = np.concatenate(instances)
+    joined: dict[Rung, Errors] = {rung: _joined(found) for rung, found in rungs.items()}
+    values = {name: np.concatenate([block[name] for block in seen]) for name in seen[0]}
+    strata = list(stratify(joined["predicted"], values, instance))
+    ladder = {rung: {key: interval(table, instance) for key, table in errors.items()}
+              for rung, errors in joined.items()}  # fmt: skip
+    title = f"{header.method} {header.variant} {header.category} {header.split}".replace("  ", " ")
+    out = request.out
+    write_bytes(out / "strata.csv", _strata_csv(strata).encode())
+    write_bytes(out / "ladder.csv", _ladder_csv(ladder).encode())
+    write_bytes(out / "strata.png", plot_strata(strata, title))
+    write_bytes(out / "ladder.png", plot_ladder(ladder, title))
+    return [out / name for name in ("ladder.csv", "ladder.png", "strata.csv", "strata.png")]
+
+
+def _joined(found: list[Errors]) -> Errors:
+    return {key: np.concatenate([errors[key] for errors in found]) for key in found[0]}
+
+
+def _fields(value: Interval) -> tuple[object, ...]:
+    record = value.record()
+    return tuple("" if record[name] is None else record[name]
+                 for name in ("mean", "low", "high", "count", "undefined"))  # fmt: skip
+
+
+def _csv(columns: Iterable[str], rows: Iterable[tuple[object, ...]]) -> str:
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return buffer.getvalue()
+
+
+def _strata_csv(strata: Iterable[Stratum]) -> str:
+    return _csv(STRATA_COLUMNS, (
+        (s.factor, s.lower, s.upper, s.metric, s.unit, s.samples, *_fields(s.value))
+        for s in strata
+    ))  # fmt: skip
+
+
+def _ladder_csv(ladder: dict[Rung, dict[tuple[str, str], Interval]]) -> str:
+    return _csv(LADDER_COLUMNS, (
+        (rung, metric, unit, *_fields(value))
+        for rung, values in ladder.items() for (metric, unit), value in values.items()
+    ))  # fmt: skip

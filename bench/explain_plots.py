@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""The plots of `scapo-bench explain`, as PNG bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bench.ladder import Rung
+from bench.statistics import Interval
+from bench.strata import FACTORS, Stratum
+
+LABELS = {
+    ("iou", "1"): "IoU",
+    ("joint_direction", "deg"): "joint direction, deg",
+    ("joint_pivot", "r4"): "joint pivot, r4",
+    ("joint_state", "deg"): "joint state, deg",
+    ("joint_state", "r4"): "joint state, r4",
+    ("part_rotation", "deg"): "part rotation, deg",
+    ("part_translation", "r4"): "part translation, r4",
+}
+"""What is plotted, in this order."""
+
+BAR, EDGE = "#4477aa", "#222222"
+
+
+def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
+    """A row per metric, a column per factor; bars with 95 % intervals, the count below each."""
+    metrics = [key for key in LABELS if any((s.metric, s.unit) == key for s in strata)]
+    names = [name for name in FACTORS if any(s.factor == name for s in strata)]
+    figure = Figure(figsize=(3.4 * len(names), 2.2 * len(metrics) + 0.6), layout="constrained")
+    grid = figure.subplots(len(metrics), len(names), squeeze=False)
+    for row, key in enumerate(metrics):
+        for column, name in enumerate(names):
+            axes: Axes = grid[row][column]
+            bins = [s for s in strata if s.factor == name and (s.metric, s.unit) == key]
+            _bars(
+                axes,
+                [s.value for s in bins],
+                [f"{s.lower:.3g} to\n{s.upper:.3g}\nn={s.samples}" for s in bins],
+            )
+            if column == 0:
+                axes.set_ylabel(LABELS[key])
+            if row == 0:
+                axes.set_title(FACTORS[name], fontsize=9)
+    return _png(figure, title)
+
+
+def plot_ladder(ladder: dict[Rung, dict[tuple[str, str], Interval]], title: str) -> bytes:
+    """A panel per metric, a bar per rung."""
+    metrics = [key for key in LABELS if key in ladder["predicted"]]
+    figure = Figure(figsize=(3.2 * len(metrics), 3.2), layout="constrained")
+    grid = figure.subplots(1, len(metrics), squeeze=False)
+    for axes, key in zip(grid[0], metrics, strict=True):
+        _bars(axes, [values[key] for values in ladder.values()], list(ladder), turned=True)
+        axes.set_title(LABELS[key], fontsize=9)
+    return _png(figure, f"{title}: one piece replaced by the truth")
+
+
+def _bars(
+    axes: Axes, values: Sequence[Interval], labels: Sequence[str], *, turned: bool = False
+) -> None:
+    for place, value in enumerate(values):
+        if value.count:
+            below, above = max(0.0, value.mean - value.low), max(0.0, value.high - value.mean)
+            axes.bar(place, value.mean, color=BAR)
+            axes.errorbar(place, value.mean, [[below], [above]], color=EDGE, capsize=2, lw=1)
+        else:
+            axes.text(place, 0, "–", ha="center", va="bottom")
+    axes.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60 if turned else 0)
+    axes.tick_params(axis="y", labelsize=7)
+    axes.margins(y=0.1)
+    axes.set_ylim(bottom=0)
+
+
+def _png(figure: Figure, title: str) -> bytes:
+    figure.suptitle(title)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
+    return buffer.getvalue()
