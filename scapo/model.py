@@ -74,8 +74,8 @@ def cpu_config() -> ScapoConfig:
         encoder=EncoderConfig(
             neighbours=12, centres=64, width=16, branch=(32, 96, 64, 32), features=48
         ),
-        decoder=DecoderConfig(patches=4, widths=(256, 128, 64)),
-        joint=JointConfig(width=64, blocks=4, head=(128, 64), points=256),
+        decoder=DecoderConfig(patches=4, points=512, widths=(128, 64, 64)),
+        joint=JointConfig(width=48, blocks=3, head=(128, 64), points=256),
         heads=HeadConfig(keypoint=(256, 128, 128), residual=(64, 64)),
         loss=LossConfig(
             recon_form="partial",
