@@ -13,7 +13,8 @@ Where neither the caller nor the source says where the front is, it is told from
   about -z, so that when they open the first tip is at +y.
 
 Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
-Left is what is left of one who looks out of the front, -y: the wearer's left of eyeglasses.
+Left of eyeglasses is the wearer's, who looks out of the front: -y. Left of a basket is that of
+somebody who looks at its front: +y.
 """
 
 from __future__ import annotations
@@ -99,6 +100,11 @@ def infer_front(
     if np.linalg.norm(level) > 0.5 * np.linalg.norm(motion):
         return snapped(level, up)
     return snapped(middle[0] - pivot[0] - axis[0] * (axis[0] @ (middle[0] - pivot[0])), up)
+
+
+def left(category: Category) -> Vector:
+    """Where the left one of two moving parts is, in the object frame."""
+    return np.array([0.0, 1.0 if category.rest == "tallest" else -1.0, 0.0])
 
 
 def blades(parts: Sequence[Float[np.ndarray, "_ 3"]], normal: Vector) -> Vector:

@@ -210,11 +210,11 @@ def _along_blades(resting: _Resting, upward: Vector, front: str | None) -> Float
 
 
 def _ordered(resting: _Resting, category: Category, rotation: Float[np.ndarray, "3 3"]) -> _Resting:
-    """Left before right (left is -y); the scissors blade from which the other opens about -z."""
+    """Left before right; the scissors blade from which the other opens about -z."""
     reduction, rests = resting.reduction, resting.rests
     if len(rests) == 2:
         middle = resting.bounds(rotation).mean(1)
-        if middle[1, 1] > middle[2, 1]:
+        if (middle[1] - middle[2]) @ frames.left(category) < 0:
             return _resting(resting.model, reordered(reduction), rests[::-1])
     elif category.name == "scissors" and (rotation @ resting.axis[0])[2] > 0:
         return _resting(resting.model, exchanged(reduction), rests)

@@ -65,6 +65,8 @@ def _is_xacro(element: Element) -> bool:
 
 def _bytes(path: Path) -> bytes:
     try:
+        if path.exists() and not path.is_file():
+            raise refuse(path, "a readable file", "something else")
         if path.stat().st_size > MAX_URDF_BYTES:
             raise refuse(path, f"at most {MAX_URDF_BYTES >> 20} MiB", "more")
         return path.read_bytes()

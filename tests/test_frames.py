@@ -16,7 +16,8 @@ from sim_assets.articulated import ArticulatedObject
 from sim_assets.reduce import words
 from sim_assets.validate import AssetError
 
-LINK = '<link name="{0}"><visual><geometry><mesh filename="meshes/{0}.stl"/></geometry></visual></link>'
+MESH = '<geometry><mesh filename="meshes/{0}.stl"/></geometry>'
+LINK = f'<link name="{{0}}"><visual>{MESH}</visual></link>'
 
 
 def write(folder: Path, links: dict[str, trimesh.Trimesh], joints: str) -> Path:
@@ -46,8 +47,13 @@ def blades() -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     blade = box((0.1, 0.008, 0.002), (0.05, 0.0, 0.001))
     arm = box((0.08, 0.008, 0.002), (-0.04, 0.008, 0.001))
     ring = trimesh.creation.annulus(0.012, 0.02, 0.002).apply_translation((-0.09, 0.022, 0.001))
-    first = trimesh.util.concatenate([blade, arm, ring])
-    return first, first.copy().apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
+    pieces = [blade, arm, ring]
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    faces = [piece.faces + start for piece, start in zip(pieces, starts, strict=False)]
+    vertices = np.concatenate([piece.vertices for piece in pieces])
+    turned = vertices * [1.0, -1.0, -1.0]
+    halves = [trimesh.Trimesh(v, np.concatenate(faces), process=False) for v in (vertices, turned)]
+    return halves[0], halves[1]
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.4, -0.3])
@@ -62,9 +68,9 @@ def test_scissors(turned: float, swap: bool, tmp_path: Path):
     joints = joint("screw", ("left", "right"), origin, f"0 0 {sign}", limit)
     thing = reader.read(write(tmp_path, links, joints), "scissors")
     assert thing.origin.rest["screw"] == pytest.approx(-turned, abs=1e-3)
-    np.testing.assert_allclose(thing.axis, [[0, 0, 1]], atol=1e-9)
-    # The first blade is the one from which the other opens about +z: here the upper one.
-    assert thing.part_mesh(0).bounds[:, 2].mean() > 0
+    np.testing.assert_allclose(thing.axis, [[0, 0, -1]], atol=1e-9)
+    # The first blade is the one from which the other opens about -z: here the lower one.
+    assert thing.part_mesh(0).bounds[:, 2].mean() < 0
     np.testing.assert_allclose(thing.pivot[0, 1:], 0, atol=1e-3)
     assert thing.part_mesh(0).vertices[:, 0].max() - thing.pivot[0, 0] == pytest.approx(
         0.1, abs=1e-3
@@ -175,9 +181,9 @@ def test_basket(zero: float, along: str, tmp_path: Path):
     assert all(q == pytest.approx(-zero, abs=1e-6) for q in thing.origin.rest.values())
     np.testing.assert_allclose(np.abs(thing.axis[:, 0]), 1, atol=1e-9)
     middles = [thing.part_mesh(part).bounds.mean(0) for part in range(3)]
-    assert middles[1][1] < middles[2][1]
+    assert middles[1][1] > middles[2][1], "left of one who looks at the front"
     down = thing.pose(thing.upper)
-    for part, side in ((1, -1), (2, 1)):
+    for part, side in ((1, 1), (2, -1)):
         vertices = thing.part_mesh(part).vertices
         laid = vertices @ down[part][:3, :3].T + down[part][:3, 3]
         assert laid[:, 2].max() < vertices[:, 2].max()

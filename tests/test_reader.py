@@ -264,8 +264,8 @@ def test_body_hung_on_its_door(tmp_path: Path):
         tmp_path,
         ('<parent link="body"/>', '<parent link="door"/>'),
         ('<child link="door"/>', '<child link="body"/>'),
-        ('xyz="-0.26 0.2 0"', 'xyz="0 0 0"'),
         ('<origin xyz="0 0 0" rpy="0 0 0"/>', '<origin xyz="0.26 -0.2 0"/>'),
+        ('xyz="-0.26 0.2 0"', 'xyz="0 0 0"'),
         (AXIS, '<axis xyz="0 0 1"/>'),
     )
     thing = reader.read(urdf, "oven", root=tmp_path)
