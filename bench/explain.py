@@ -50,7 +50,7 @@ def explain(request: Request) -> list[Path]:
     joined: dict[Rung, Errors] = {rung: _joined(found) for rung, found in rungs.items()}
     values = {name: np.concatenate([block[name] for block in seen]) for name in seen[0]}
     strata = list(stratify(joined["predicted"], values, instance))
-    ladder = {rung: {key: interval(table, instance) for key, table in errors.items()}
+    ladder: dict[Rung, dict[tuple[str, str], Interval]] = {rung: {key: interval(table, instance) for key, table in errors.items()}
               for rung, errors in joined.items()}  # fmt: skip
     title = f"{header.method} {header.variant} {header.category} {header.split}".replace("  ", " ")
     out = request.out

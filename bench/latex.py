@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tables as LaTeX documents of one page or more (booktabs, longtable)."""
+"""Tables as LaTeX documents of one page (booktabs)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ _ESCAPES = {
     "±": r"$\pm$", "–": "--", "×": r"$\times$", "<": r"$<$", ">": r"$>$", "|": r"$|$",
 }  # fmt: skip
 
-PREAMBLE = r"""\documentclass{article}
-\usepackage[a4paper,landscape,margin=12mm]{geometry}
-\usepackage{amssymb,booktabs,longtable}
-\usepackage[T1]{fontenc}
-\usepackage[utf8]{inputenc}
-\pagestyle{empty}
-\begin{document}
-\scriptsize
-\setlength{\tabcolsep}{3pt}
-"""
+PREAMBLE = r"""\documentclass{{article}}
+\usepackage[paperwidth={width}mm,paperheight={height}mm,margin=12mm]{{geometry}}
+\usepackage{{amssymb,booktabs}}
+\usepackage[T1]{{fontenc}}
+\pagestyle{{empty}}
+\setlength{{\tabcolsep}}{{3pt}}
+\setlength{{\parindent}}{{0pt}}
+\begin{{document}}
+\scriptsize"""
 
 
 def escape(text: str) -> str:
@@ -33,26 +32,22 @@ def escape(text: str) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A document of one `longtable`, with the notes below."""
-    width = 5 + len(table.columns)
-    head = [*_over(table), _heads(table) + r" \\"]
+    """A document of one page as large as the table, with the notes below."""
+    count = sum(len(block.rows) + 1 for block in table.blocks)
+    wide = any(cell.low is not None for b in table.blocks for row in b.rows for cell in row.cells)
+    width = 110 + len(table.columns) * (34 if wide else 18)
     lines = [
-        PREAMBLE.rstrip(),
-        rf"\noindent\textbf{{Table {table.number}.}} {escape(table.title)}.\par\medskip",
-        rf"\begin{{longtable}}{{@{{}}ll{'c' * 3}{'r' * len(table.columns)}@{{}}}}",
+        PREAMBLE.format(width=width, height=50 + 4 * count + 8 * len(table.notes)),
+        rf"\textbf{{Table {table.number}.}} {escape(table.title)}.\par\medskip",
+        rf"\begin{{tabular}}{{@{{}}ll{'c' * 3}{'r' * len(table.columns)}@{{}}}}",
         r"\toprule",
-        *head,
-        r"\midrule",
-        r"\endhead",
-        r"\bottomrule",
-        r"\endfoot",
+        *_over(table),
+        _heads(table) + r" \\",
     ]
-    for number, block in enumerate(table.blocks):
-        if number:
-            lines.append(r"\midrule")
-        lines += _block(block, width)
-    lines.append(r"\end{longtable}")
-    lines += [rf"\noindent {escape(note)}\par" for note in table.notes]
+    for block in table.blocks:
+        lines += [r"\midrule", *_block(block, 5 + len(table.columns))]
+    lines += [r"\bottomrule", r"\end{tabular}\par\medskip"]
+    lines += [rf"{escape(note)}\par" for note in table.notes]
     return "\n".join([*lines, r"\end{document}", ""])
 
 
@@ -75,7 +70,7 @@ def _heads(table: Table) -> str:
 
 
 def _block(block: Block, width: int) -> list[str]:
-    heading = rf"\multicolumn{{{width}}}{{@{{}}l}}{{\textbf{{{escape(block.heading)}}}}} \\*"
+    heading = rf"\multicolumn{{{width}}}{{@{{}}l@{{}}}}{{\textbf{{{escape(block.heading)}}}}} \\"
     return [heading, *(_row(row) for row in block.rows)]
 
 
