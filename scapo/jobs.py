@@ -64,13 +64,14 @@ class _Worker:
 class Pool(Generic[Job, Result]):
     """Worker processes, as a context manager; leaving it ends them.
 
-    Args of the constructor: `workers` >= 1 processes; `timeout` seconds without a sign of life
-    after which a job counts as hung and its worker is killed.
+    Args of the constructor: `workers` processes, 0 for none: then jobs are done in this process,
+    which a job that dies takes with it; `timeout` seconds without a sign of life after which a job
+    counts as hung and its worker is killed.
     """
 
     def __init__(self, workers: int, *, timeout: float = 300.0) -> None:
-        if workers < 1:
-            raise ValueError(f"workers: expected 1 or more, found {workers}")
+        if workers < 0:
+            raise ValueError(f"workers: expected 0 or more, found {workers}")
         self.size = workers
         self.timeout = timeout
         self._workers: list[_Worker] = []
@@ -97,6 +98,9 @@ class Pool(Generic[Job, Result]):
             on_report: Called in this process with the job and each of its reports.
         """
         waiting = deque(jobs)
+        if not self.size:
+            yield from (_do_here(function, job, on_report) for job in waiting)
+            return
         while waiting or any(worker.busy for worker in self._workers):
             self._hand_out(function, waiting)
             ready = wait([worker.pipe for worker in self._workers if worker.busy], TICK)
@@ -163,6 +167,27 @@ class Pool(Generic[Job, Result]):
     def _drop(self, worker: _Worker) -> None:
         self._workers.remove(worker)
         _end(worker)
+
+
+def _do_here(
+    function: Callable[[Job, Report], Result],
+    job: Job,
+    on_report: Callable[[Job, str, int], None] | None,
+) -> Outcome[Job, Result]:
+    """Do a job in this process."""
+    last = ""
+
+    def report(label: str, amount: int) -> None:
+        nonlocal last
+        last = label
+        if on_report is not None:
+            on_report(job, label, amount)
+
+    try:
+        return Outcome(job=job, result=function(job, report))
+    except Exception as error:  # noqa: BLE001 - whatever it is, it costs this job only
+        reason = describe_error(error)
+        return Outcome(job=job, result=None, failure="error", reason=reason, label=last)
 
 
 def _outcome(

@@ -5,10 +5,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from sim_assets import procedural
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.reader import find, instance_id, read, select
+
+
+@runtime_checkable
+class Asset(Protocol):
+    """What can be loaded; picklable."""
+
+    @property
+    def name(self) -> str:
+        """The instance id of the object that `load` gives."""
+        ...
+
+    def load(self) -> ArticulatedObject:
+        """Make or read the object.
+
+        Raises:
+            ValueError: It cannot be used, and why.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,7 +41,7 @@ class ProceduralAsset:
 
     @property
     def name(self) -> str:
-        """For messages."""
+        """The instance id."""
         return f"{self.category}-{self.split}-{self.seed}-{self.index:05d}"
 
     def load(self) -> ArticulatedObject:
@@ -64,9 +83,6 @@ class UrdfAsset:
             scale=self.scale,
             root=self.root,
         )
-
-
-Asset = ProceduralAsset | UrdfAsset
 
 
 def procedural_assets(category: str, split: str, seed: int, count: int) -> list[Asset]:

@@ -123,7 +123,7 @@ class Generate:
     """Folder of the data set."""
     data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
     workers: int = os.cpu_count() or 1
-    """Processes."""
+    """Processes; 0: work in this one, unprotected against objects that crash or hang."""
     engine: Literal["local"] = "local"
     """Where they run."""
     timeout: float = 300.0

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from scapo.jobs import ONE_THREAD, Pool, describe_error
+from scapo.jobs import ONE_THREAD, Pool, _cause, describe_error
 
 
 def act(job: tuple[str, int], report) -> object:
@@ -20,8 +20,6 @@ def act(job: tuple[str, int], report) -> object:
         raise ValueError(f"number {number}:\n expected less")
     if verb == "die":
         os.kill(os.getpid(), signal.SIGKILL)
-    if verb == "exit":
-        os._exit(7)
     if verb == "hang":
         time.sleep(600)
     if verb == "tick":
@@ -51,6 +49,9 @@ def test_a_job_that_fails_dies_or_hangs_costs_that_job_only():
             for outcome in pool.run(act, jobs, lambda job, label, n: heard.append((label, n)))
         }
         after = [outcome.result for outcome in pool.run(act, [("square", 9)])]
+        processes = [worker.process for worker in pool._workers]
+        assert any(process.is_alive() for process in processes)
+    assert not any(process.is_alive() for process in processes)
     assert after == [81]
     assert set(outcomes) == set(jobs)
     assert [outcomes["square", n].result for n in (1, 8)] == [1, 64]
@@ -60,19 +61,9 @@ def test_a_job_that_fails_dies_or_hangs_costs_that_job_only():
         ("raise", 2): ("error", "number 2: expected less", "raise 2"),
         ("die", 3): ("died", "its process was ended by SIGKILL", "die 3"),
         ("hang", 4): ("hung", "no sign of life for 1.5 s", "hang 4"),
-        ("exit", 5): ("died", "its process ended with exit code 7", "exit 5"),
     }
     assert outcomes["environment", 7].result == dict.fromkeys(ONE_THREAD, "1")
     assert ("square 1", 1) in heard
-
-
-def test_workers_end_with_the_pool():
-    with Pool(1) as pool:
-        (outcome,) = pool.run(act, [("square", 3)])
-        process = pool._workers[0].process
-        assert process.is_alive()
-    assert outcome.result == 9
-    assert not process.is_alive()
 
 
 def test_no_jobs_start_no_process():
@@ -81,9 +72,27 @@ def test_no_jobs_start_no_process():
         assert pool._workers == []
 
 
-def test_a_pool_needs_a_worker():
-    with pytest.raises(ValueError, match="workers: expected 1 or more, found 0"):
-        Pool(0)
+def test_without_workers_jobs_are_done_here():
+    heard: list[str] = []
+    with Pool(0) as pool:
+        outcomes = list(
+            pool.run(act, [("square", 2), ("raise", 3)], lambda job, label, n: heard.append(label))
+        )
+    assert heard == ["square 2", "raise 3"]
+    assert outcomes[0].result == 4
+    assert (outcomes[1].failure, outcomes[1].label) == ("error", "raise 3")
+    assert outcomes[1].reason == "number 3: expected less"
+
+
+def test_a_negative_number_of_workers_is_refused():
+    with pytest.raises(ValueError, match="workers: expected 0 or more, found -1"):
+        Pool(-1)
+
+
+def test_how_a_process_ended():
+    assert _cause(7) == "its process ended with exit code 7"
+    assert _cause(-11) == "its process was ended by SIGSEGV"
+    assert _cause(None) == "its process ended with exit code None"
 
 
 def test_errors_in_one_line():
