@@ -13,7 +13,7 @@ from sim_assets.procedural import shapes, solids
 
 
 def closed(mesh: trimesh.Trimesh) -> bool:
-    return mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    return bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0)
 
 
 def test_box_volume():

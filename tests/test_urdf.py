@@ -53,7 +53,7 @@ def chain() -> tuple[list[Link], list[Joint]]:
 
 
 def turn(axis: np.ndarray, angle: float, pivot: np.ndarray) -> np.ndarray:
-    return trimesh.transformations.rotation_matrix(angle, axis, pivot)
+    return np.asarray(trimesh.transformations.rotation_matrix(angle, axis, pivot))
 
 
 def test_yourdfpy_poses_every_link_as_meant(tmp_path: Path):
@@ -69,7 +69,7 @@ def test_yourdfpy_poses_every_link_as_meant(tmp_path: Path):
 
 
 def _shift(offset: np.ndarray) -> np.ndarray:
-    return trimesh.transformations.translation_matrix(offset)
+    return np.asarray(trimesh.transformations.translation_matrix(offset))
 
 
 def test_meshes_come_back_exactly(tmp_path: Path):

@@ -123,7 +123,7 @@ def _outline(s: BasketShape, z: float, inset: float = 0.0) -> Loop:
     scale = s.taper + (1 - s.taper) * max(z / s.height, 0.0) ** s.curve
     size = np.array([s.width, s.length]) * scale - 2 * inset
     radius = max(s.corner * size[0], 0.002)
-    return resampled(rectangle(*size, radius, segments=12), COUNT)
+    return resampled(rectangle(size[0], size[1], radius, segments=12), COUNT)
 
 
 def _outward(loop: Loop) -> Float[np.ndarray, "N 2"]:

@@ -222,8 +222,9 @@ def _tray(s: DrawerShape) -> list[Visual]:
     start = s.front_x - 0.001
     end = s.tray_depth * (s.depth - s.board)
     size = np.array([end - start, s.inner - 2 * (0.011 if s.rails else 0.004)])
-    outer = rectangle(*size, 0.002, segments=1)
-    inside = rectangle(*(size - 2 * s.tray_wall), 0.001, segments=1)
+    outer = rectangle(size[0], size[1], 0.002, segments=1)
+    hollow = size - 2 * s.tray_wall
+    inside = rectangle(hollow[0], hollow[1], 0.001, segments=1)
     floor = 0.006
     rings = [at(outer, 0.0), at(outer, tall), at(inside, tall), at(inside, floor)]
     middle = np.array([(start + end) / 2, 0.0, low])

@@ -188,8 +188,8 @@ def _temple(s: EyeglassesShape, lean: float) -> list[Visual]:
     visuals = [painted(bar, s.temple_color)]
     if s.ear_tips:
         tail = path[t > s.bend - 0.03]
-        size = np.array([s.temple_thickness, s.temple_slim * s.temple_height]) + 0.0008
-        tip = sweep(tail, superellipse(*size, 3.0, 14), (0.0, 0.0, 1.0))
+        size = (s.temple_thickness + 0.0008, s.temple_slim * s.temple_height + 0.0008)
+        tip = sweep(tail, superellipse(size[0], size[1], 3.0, 14), (0.0, 0.0, 1.0))
         visuals.append(painted(tip, shade(s.rim_color, 0.8)))
     if s.barrel:
         visuals.append(painted(_barrels(s, lean)[1], METAL))

@@ -82,6 +82,11 @@ class ScissorsShape:
         """Of a blade at the pivot."""
         return self.blade_width * self.blade
 
+    @property
+    def section(self) -> float:
+        """Half the thickness of the rings' section, thin enough for a finger to pass."""
+        return min(self.ring_radius, 0.15 * self.ring_width)
+
 
 HELD_OUT: HeldOut = (
     {"sleeve": True, "metal_grip": True},
@@ -93,8 +98,8 @@ SYMMETRIC = {"big_ring": False, "tang": False}
 
 def _ring_outline(s: ScissorsShape, factor: float) -> np.ndarray:
     """The centre line of a ring (N, 2), its point nearest to the pivot at the origin."""
-    length = factor * s.ring_length - 2 * s.ring_radius
-    width = (0.4 + 0.6 * factor) * s.ring_width - 2 * s.ring_radius
+    length = factor * s.ring_length - 2 * s.section
+    width = (0.4 + 0.6 * factor) * s.ring_width - 2 * s.section
     loop = superellipse(length, width, s.ring_power, 36)
     loop[:, 1] *= 1 - 0.25 * loop[:, 0] / length  # wider away from the pivot
     return loop - [length / 2, 0.0]
@@ -106,7 +111,7 @@ def _ring_path(s: ScissorsShape, factor: float) -> np.ndarray:
     cosine, sine = np.cos(s.splay), np.sin(s.splay)
     loop = loop @ np.array([[cosine, sine], [-sine, cosine]])
     loop[:, 0] -= s.shank * s.blade
-    loop[:, 1] -= loop[:, 1].max() + s.ring_radius + 0.001
+    loop[:, 1] -= loop[:, 1].max() + s.section + 0.001
     return np.column_stack([loop, np.zeros(len(loop))])
 
 
@@ -161,7 +166,7 @@ def _strip(s: ScissorsShape) -> trimesh.Trimesh:
 
 def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
     """The ring, and a sleeve around the shank's end."""
-    section = superellipse(2 * s.ring_radius, 2 * s.ring_radius * s.ring_height, 2.4, 12)
+    section = superellipse(2 * s.section, 2 * s.section * s.ring_height, 2.4, 12)
     pieces = [sweep(path, section, (0.0, 0.0, 1.0), closed=True)]
     root = _root(path)
     if s.sleeve:
@@ -178,7 +183,7 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
         profile = superellipse(1.0, 1.0, 4.0, 12)
         pieces.append(sweep(line, [profile * size for size in sizes], (0.0, 0.0, 1.0)))
     if s.stop:
-        bump = ellipsoid((0.008, 0.004, 2 * s.ring_radius), 10)
+        bump = ellipsoid((0.008, 0.004, 2 * s.section), 10)
         inner = root - np.array([0.25 * s.ring_length, 0.0, 0.0])
         near = path[np.linalg.norm(path - inner, axis=1).argmin()]
         pieces.append(placed(bump, near))
@@ -209,8 +214,8 @@ def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
         visuals.append(painted(rivet, shade(STEEL, 0.8)))
     if s.pads:
         flat = path - path.mean(0)
-        scale = 1 - s.ring_radius / np.linalg.norm(flat, axis=1, keepdims=True)
-        section = superellipse(1.1 * s.ring_radius, 1.3 * s.ring_radius, 2.0, 8)
+        scale = 1 - s.section / np.linalg.norm(flat, axis=1, keepdims=True)
+        section = superellipse(1.1 * s.section, 1.3 * s.section, 2.0, 8)
         pad = sweep(path.mean(0) + flat * scale, section, (0.0, 0.0, 1.0), closed=True)
         visuals.append(painted(pad, (0.2, 0.2, 0.22)))
     return visuals
