@@ -33,11 +33,13 @@ def escape(text: str) -> str:
 
 def to_latex(table: Table) -> str:
     """A document of one page as large as the table, with the notes below."""
-    count = sum(len(block.rows) + 1 for block in table.blocks)
-    wide = any(cell.low is not None for b in table.blocks for row in b.rows for cell in row.cells)
-    width = 110 + len(table.columns) * (34 if wide else 18)
+    rows = [row for block in table.blocks for row in block.rows]
+    wide = any(cell.low is not None for row in rows for cell in row.cells)
+    width = 80 + len(table.columns) * (26 if wide else 13)
+    height = 45 + 3 * (len(rows) + len(table.blocks)) + 3 * len(table.blocks)
+    height += sum(3 + 3 * len(note) // width for note in table.notes)
     lines = [
-        PREAMBLE.format(width=width, height=50 + 4 * count + 8 * len(table.notes)),
+        PREAMBLE.format(width=width, height=height),
         rf"\textbf{{Table {table.number}.}} {escape(table.title)}.\par\medskip",
         rf"\begin{{tabular}}{{@{{}}ll{'c' * 3}{'r' * len(table.columns)}@{{}}}}",
         r"\toprule",
