@@ -78,8 +78,8 @@ def check_rows(thing: ArticulatedObject, rows: list[Row], *, surfaces: int) -> N
             )
             moved = joint_motion(pivot, axis, state, joint.kind) @ pose[joint.parent]
             assert (moved - pose[joint.child]).abs().max() < 1e-5
-            local = [torch.from_numpy(x[j]) for x in (thing.pivot, thing.axis)]
-            parent = pose[joint.parent] @ joint_motion(*local, state, joint.kind)
+            pivot, axis = torch.from_numpy(thing.pivot[j]), torch.from_numpy(thing.axis[j])
+            parent = pose[joint.parent] @ joint_motion(pivot, axis, state, joint.kind)
             assert (parent - pose[joint.child]).abs().max() < 1e-5
             assert 0.15 <= row["joint_state"][j] / thing.upper[j] <= 0.95 + 1e-6
             assert np.linalg.norm(row["joint_axis"][j]) == pytest.approx(1, abs=1e-6)
