@@ -145,13 +145,12 @@ def test_parts_do_not_reach_into_one_another(category: str):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 @categories
 def test_parts_do_not_reach_into_one_another_on_many(category: str):
-    for index in range(12):
+    for index in range(6):
         obj = generate(category, "train" if index % 2 else "test-ood", 3, index)
-        steps = 9 if len(obj.upper) == 1 else 4
-        assert penetration(obj, spread_states(obj, steps)) == 0.0
+        steps = 7 if len(obj.upper) == 1 else 4
+        assert penetration(obj, spread_states(obj, steps), count=1000) == 0.0
 
 
 def test_a_collision_is_found():
