@@ -25,7 +25,6 @@ from sim_assets.ledger import FINISHED, PLAN, GenerateError
 from sim_assets.options import DataOptions
 from sim_assets.plan import Request
 from sim_assets.request import make_request, versions
-from sim_assets.stream import stream
 from tests.boxes import laptop
 
 FULL = DataOptions(protocol="full", points=64, count=30, instances=5)
@@ -292,33 +291,3 @@ def stop(
         time.sleep(0.01)
     os.killpg(process.pid, how)
     return process, process.communicate(timeout=60)[1].decode()
-
-
-def test_options_out_of_range_are_refused():
-    for change, message in (
-        ({"count": 0}, "count: expected 1 or more, found 0"),
-        ({"points": 7}, "points: expected 8 or more, found 7"),
-        ({"instances": 31}, "instances: expected at most count, 30, found 31"),
-        ({"states_per_view": 4}, "count: expected a multiple of states_per_view, 4, found 30"),
-        ({"image_size": 5000}, "image_size: expected 4096 or less, found 5000"),
-        ({"up": "z"}, "expected only with a --source folder"),
-        ({"source": "/nowhere/at/all"}, "/nowhere/at/all: expected a folder"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            make_request("laptop", replace(FULL, **change))
-    with pytest.raises(ValueError, match="category 'chair': expected one of laptop"):
-        next(stream("chair"))
-    with pytest.raises(TypeError, match="colour"):
-        stream("laptop", colour=True)
-
-
-def test_a_folder_of_models_in_place_of_a_generator(tmp_path, shared_dir):
-    source = shared_dir / "assets" / "laptop"
-    options = DataOptions(source=str(source), count=12, points=128, protocol="full")
-    request, assets = make_request("laptop", options)
-    made = generate(request, assets, tmp_path / "split", VERSIONS, HERE)
-    assert made.failed == {}
-    record = made.manifest.instances[0]
-    assert not Path(record.source).is_absolute()
-    assert made.manifest.options["source"] == "urdf"
-    assert str(source) not in (tmp_path / "split/manifest.json").read_text()
