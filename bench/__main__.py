@@ -16,24 +16,32 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from bench.predict import Predict
+from bench.train import prepare, train_verb
 from bench.verbs import VERBS
 
 DESCRIPTION = "Train, predict, score and tabulate methods of articulated pose estimation."
 
 
-def _commands() -> Any:  # noqa: ANN401 - a union made at run time
-    commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in VERBS.items()]
+def _commands(preset: str | None) -> Any:  # noqa: ANN401 - a union made at run time
+    verbs = {"train": train_verb(preset), "predict": Predict, **VERBS}
+    commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in verbs.items()]
     return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and end the process."""
+    words, preset = prepare(sys.argv[1:] if arguments is None else arguments)
     command: Any = tyro.cli(
-        _commands(),
+        _commands(preset),
         prog="scapo-bench",
         description=DESCRIPTION,
-        args=arguments,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        args=words,
+        config=(
+            tyro.conf.OmitSubcommandPrefixes,
+            tyro.conf.CascadeSubcommandArgs,
+            tyro.conf.FlagCreatePairsOff,
+        ),
     )
     try:
         command.run(Console())

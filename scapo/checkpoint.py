@@ -51,15 +51,11 @@ def load_arrays(module: nn.Module, arrays: Arrays, where: Path, prefix: str = ""
         for name, value in arrays.items()
         if name.startswith(prefix)
     }
-    expected = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
-    found = {name: tuple(tensor.shape) for name, tensor in state.items()}
-    for name in sorted(expected.keys() | found.keys()):
-        if expected.get(name) != found.get(name):
-            raise StoreError(
-                f"{where}: tensor {prefix + name!r}: expected shape {expected.get(name)}, "
-                f"found {found.get(name)}"
-            )
-    module.load_state_dict(state)
+    try:
+        module.load_state_dict(state)
+    except RuntimeError as error:
+        found = " ".join(str(error).split())
+        raise StoreError(f"{where}: expected the method's tensors, found {found}") from error
 
 
 def adam_arrays(optimizer: torch.optim.Optimizer) -> Arrays:

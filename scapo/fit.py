@@ -26,6 +26,9 @@ from scapo.log import Log
 from scapo.method import AbstractMethod, Stage, Step
 from scapo.resident import TrainingData
 
+TIMING = "timing.json"
+"""What differs from run to run, apart from all that does not."""
+
 
 class TrainingError(ArithmeticError):
     """The loss or its gradient is not finite; the message names the file with the batch."""
@@ -280,6 +283,8 @@ class Trainer:
         }
         write(self.folder / checkpoint.TRAINING, arrays, training)
         checkpoint.write_checkpoint(self.folder / checkpoint.WEIGHTS, self.method, header)
+        timing = {"seconds": self.position.seconds, "samples_per_second": self.position.rates}
+        write_bytes(self.folder / TIMING, (json.dumps(timing, indent=1) + "\n").encode())
         self.saved = time.monotonic()
 
 

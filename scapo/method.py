@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
 from scapo.types import Category, Labels, Observation, Prediction, Supervision
+
+Mode = Literal["fast", "refine"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,6 +64,11 @@ class AbstractMethod(nn.Module, ABC):
     category: Category
     supervision: frozenset[Supervision]
 
+    @property
+    @abstractmethod
+    def variant(self) -> str:
+        """How this run differs from the method's default, as tables name it; "" = it does not."""
+
     @abstractmethod
     def stages(self) -> tuple[Stage, ...]:
         """The stages of training, in order; none for a method without parameters."""
@@ -93,5 +100,11 @@ class AbstractMethod(nn.Module, ABC):
         """
 
     @abstractmethod
-    def predict(self, observation: Observation) -> Prediction:
-        """Parts, poses and joints of a batch, in metres and the camera frame."""
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
+        """Parts, poses and joints of a batch, in metres and the camera frame.
+
+        Args:
+            observation: A batch, camera frame, metres.
+            mode: `fast`, networks only; `refine`, with search or optimisation at test time. A
+                method that knows one way alone takes it in both modes.
+        """

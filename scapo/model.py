@@ -32,7 +32,7 @@ from scapo.articulation import (
 from scapo.augment import random_pose
 from scapo.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig
 from scapo.geometry import apply, rigid
-from scapo.method import AbstractMethod, ParameterGroup, Stage, Step
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
 from scapo.objectives import Explanation, LossConfig, articulation, canonicalisation
 from scapo.points import Similarity, normalise
 from scapo.skinning import Bones, cross_maps, part_maps
@@ -47,6 +47,8 @@ ARTICULATE = "articulate"
 class ScapoConfig:
     """Everything that can be chosen; the defaults are the paper's values (Sec. 4)."""
 
+    preset: Literal["paper", "cpu"] = "paper"
+    """Where the other defaults come from."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     joint: JointConfig = field(default_factory=JointConfig)
@@ -71,6 +73,7 @@ class ScapoConfig:
 def cpu_config() -> ScapoConfig:
     """The lean preset: under 1.5 M parameters, a few edges at a few centres, one-sided terms."""
     return ScapoConfig(
+        preset="cpu",
         encoder=EncoderConfig(
             neighbours=12, centres=64, width=16, branch=(32, 96, 64, 32), features=48
         ),
@@ -119,6 +122,14 @@ class Scapo(AbstractMethod):
             self.template = Template(config.decoder.points, parts)
             self.bones = Bones(parts, config.gamma)
         initialise(self, generator)
+
+    @property
+    def variant(self) -> str:
+        """The preset, SJ for the supervised variant, and the ablated terms."""
+        config = self.config
+        words = [] if config.preset == "paper" else [config.preset]
+        words += ["SJ"] if config.supervision else []
+        return "-".join([*words, *(f"wo_{term}" for term in config.loss.without)])
 
     def stages(self) -> tuple[Stage, ...]:
         """Two stages of Adam with cosine annealing (Sec. 4)."""
@@ -235,7 +246,7 @@ class Scapo(AbstractMethod):
         return terms
 
     @torch.no_grad()
-    def predict(self, observation: Observation) -> Prediction:
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (PROTOCOL 4.4).
 
         The part frames are the template's: every part's pose carries the template onto the

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""`scapo-bench predict RUN`: a trained method's answers to a split, as a predictions file."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import track
+
+from bench.methods import load
+from bench.oracle import OracleMethod
+from bench.predictions import Header, write_predictions
+from bench.train import pick_device
+from scapo.data import SampleDataset, label, observe
+from scapo.files import Arrays
+from scapo.fit import TIMING
+from scapo.method import AbstractMethod, Mode
+from scapo.resident import map_labels
+from scapo.store import open_split
+from scapo.types import Observation, Prediction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Predict:
+    """Predict parts, poses and joints of every cloud of a split."""
+
+    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, or a checkpoint file."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    out: Path
+    """Predictions file, NAME.safetensors."""
+    split: str = "test"
+    """Split to predict."""
+    mode: Mode = "fast"
+    """fast: networks only; refine: with optimisation at test time."""
+    device: str = "auto"
+    """auto (CUDA where there is a GPU), cpu, cuda, ..."""
+    batch: int = 32
+    """Clouds at a time."""
+
+    def run(self, console: Console) -> None:
+        """Load, predict batch by batch, write the file."""
+        method, header = load(self.checkpoint)
+        device = pick_device(self.device)
+        method.to(device)
+        split = open_split(self.data, header["category"], self.split)
+        samples = SampleDataset(split)
+        batches = torch.arange(len(samples)).split(self.batch)
+        started = time.perf_counter()
+        arrays = [
+            answer(method, samples, index, device, self.mode)
+            for index in track(batches, description="predict", console=console)
+        ]
+        seconds = (time.perf_counter() - started) / len(samples)
+        words = [method.variant, "" if self.mode == "fast" else self.mode]
+        write_predictions(
+            self.out,
+            Header(
+                method=method.name,
+                variant="-".join(word for word in words if word),
+                category=header["category"],
+                split=self.split,
+                seed=header["seed"],
+                data_digest=split.manifest.digest,
+                supervision=tuple(sorted(method.supervision)),
+                budget={
+                    "device": device,
+                    "parameters": sum(item.numel() for item in method.parameters()),
+                    "steps": header["steps"],
+                    **timing(self.checkpoint),
+                    "seconds_per_cloud": round(seconds, 5),
+                    "oracle": sorted(method.oracle) if isinstance(method, OracleMethod) else [],
+                },
+            ),
+            {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]},
+        )
+        console.print(
+            f"{len(samples)} clouds, {1000 * seconds:.1f} ms each: {self.out}", soft_wrap=True
+        )
+
+
+def timing(run: Path) -> dict[str, Any]:
+    """Seconds of training, where the run folder is at hand."""
+    path = (run if run.is_dir() else run.parent) / TIMING
+    if not path.is_file():
+        return {}
+    return {"training_seconds": round(json.loads(path.read_text())["seconds"], 1)}
+
+
+def answer(
+    method: AbstractMethod, samples: SampleDataset, index: torch.Tensor, device: str, mode: Mode
+) -> Arrays:
+    """The tensors of a predictions file for the samples of `index`.
+
+    Only a method that declares an oracle is shown labels, those it declares; its header and its
+    row in the tables say so.
+    """
+    batch = samples.batch(index)
+    observation = Observation(points=observe(batch).points.to(device))
+    if isinstance(method, OracleMethod):
+        labels = map_labels(label(batch).keep(method.oracle), lambda tensor: tensor.to(device))
+        return to_arrays(method.predict_given(observation, labels))
+    return to_arrays(method.predict(observation, mode))
+
+
+def to_arrays(prediction: Prediction) -> Arrays:
+    """CONTRACT 3's tensors; what the method does not say is left out."""
+    joints = prediction.joints
+    tensors = {
+        "part_weight": prediction.part_weight,
+        "camera_T_part": prediction.camera_T_part,
+        "joint_pivot": None if joints is None else joints.pivot,
+        "joint_axis": None if joints is None else joints.axis,
+        "joint_state": None if joints is None else joints.state,
+        "canonical_points": prediction.canonical_points,
+        "confidence_sample": prediction.confidence,
+    }
+    return {
+        name: tensor.detach().cpu().numpy().astype(np.float32)
+        for name, tensor in tensors.items()
+        if tensor is not None
+    }
