@@ -72,26 +72,24 @@ def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
     data = files.read(path)
     if not data.strip():
         raise refuse(path, "a mesh", "an empty file")
-    scene = _scene(path, form, data, MeshResolver(files, path))
-    pieces = [
-        _piece(mesh)
-        for mesh in scene.dump()
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
-    ]
+    pieces, units = _parse(path, form, data, MeshResolver(files, path))
     if not pieces:
         raise refuse(path, "a mesh with triangles", "none")
     for piece in pieces:
         check_mesh(path, piece.mesh)
-    return _both_sides(pieces, scene)
+    return _both_sides(pieces, _unit(units))
 
 
-def _scene(path: Path, form: str, data: bytes, resolver: MeshResolver) -> trimesh.Scene:
+def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[list[Visual], str]:
+    """Pieces in the scene's frame, and its units; whatever a loader raises is a refusal."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return trimesh.load_scene(
+            scene = trimesh.load_scene(
                 io.BytesIO(data), file_type=form, resolver=resolver, process=False
             )
+            meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+            return [_piece(mesh) for mesh in meshes if len(mesh.faces)], str(scene.units)
     except AssetError:
         raise
     except ImportError as error:
@@ -104,6 +102,8 @@ def _scene(path: Path, form: str, data: bytes, resolver: MeshResolver) -> trimes
 def _piece(mesh: trimesh.Trimesh) -> Visual:
     """A mesh with its main colour; a texture with coordinates stays on it."""
     vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64)
+    if vertices.shape != (len(vertices), 3) or faces.shape != (len(faces), 3):
+        raise ValueError(f"vertices and faces of three numbers, not {vertices.shape[1:]}")
     plain = trimesh.Trimesh(vertices, faces, process=False, validate=False)
     visual = mesh.visual
     if not isinstance(visual, TextureVisuals):
@@ -127,9 +127,8 @@ def _rgba(color: object) -> Color:
     return red, green, blue, alpha
 
 
-def _both_sides(pieces: list[Visual], scene: trimesh.Scene) -> list[Visual]:
-    """Two-sided pieces in metres; whether a shell is closed is asked of the whole file."""
-    scale = _unit(str(scene.units)) if scene.units else 1.0
+def _both_sides(pieces: list[Visual], scale: float) -> list[Visual]:
+    """Two-sided pieces, scaled; whether a shell is closed is asked of the whole file."""
     result = []
     offsets = np.cumsum([0, *(len(piece.mesh.vertices) for piece in pieces)])
     stacked = np.concatenate([piece.mesh.vertices for piece in pieces])
