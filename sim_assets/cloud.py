@@ -68,24 +68,32 @@ def truth(
     )
 
 
-def count_visible(frames: list[Frame]) -> int:
-    """Pixels of all pictures that show the object."""
-    return sum(int(np.count_nonzero(frame.part != BACKGROUND)) for frame in frames)
+def visible_pixels(frames: list[Frame]) -> list[Int[np.ndarray, " _"]]:
+    """Flat indices of the pixels that show the object, per picture."""
+    return [np.flatnonzero(frame.part != BACKGROUND) for frame in frames]
 
 
 def sample_frames(
     frames: list[Frame],
+    seen: list[Int[np.ndarray, " _"]],
     camera: Intrinsics,
     count: int,
     rng: np.random.Generator,
-    sampling: Sampling = "random",
+    sampling: Sampling,
 ) -> Cloud:
     """Draw `count` visible pixels of one picture, or of one picture per part, as points.
 
     Without replacement where there are enough pixels. Only drawn pixels are back-projected,
     unless the sampling needs all of them.
+
+    Args:
+        frames: One picture of the whole object, or one per part.
+        seen: Their `visible_pixels`.
+        camera: Intrinsics.
+        count: Points wanted.
+        rng: Where chance comes from.
+        sampling: How to choose.
     """
-    seen = [np.flatnonzero(frame.part != BACKGROUND) for frame in frames]
     pixel = np.concatenate(seen)
     source = np.repeat(np.arange(len(frames)), [len(index) for index in seen])
     if sampling == "random":
@@ -174,19 +182,17 @@ class Surface:
         """
         turn = camera_T_part[:, :3, :3].transpose(0, 2, 1)
         points = self.points @ turn + camera_T_part[:, None, :3, 3]
-        normals = self.normals @ turn
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-        u = np.floor(np.nan_to_num(x * camera.fx + camera.cx, nan=-1, posinf=-1, neginf=-1))
-        v = np.floor(np.nan_to_num(y * camera.fy + camera.cy, nan=-1, posinf=-1, neginf=-1))
-        inside = (points[..., 2] > 0) & (u >= 0) & (v >= 0)
-        inside &= (u < camera.width) & (v < camera.height)
+        nx, ny, nz = np.moveaxis(self.normals @ turn, -1, 0)
+        x, y, z = np.moveaxis(points, -1, 0)
+        ahead = np.maximum(z, 1e-9)
+        u = np.floor(x / ahead * camera.fx + camera.cx)
+        v = np.floor(y / ahead * camera.fy + camera.cy)
+        inside = (z > 1e-9) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
         pixel = np.where(inside, v * camera.width + u, 0).astype(np.intp)
         ray_x = (u + 0.5 - camera.cx) / camera.fx
         ray_y = (v + 0.5 - camera.cy) / camera.fy
-        along = ray_x * normals[..., 0] + ray_y * normals[..., 1] + normals[..., 2]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            plane = (points * normals).sum(-1) / along
+        along = ray_x * nx + ray_y * ny + nz
+        plane = (x * nx + y * ny + z * nz) / np.where(along == 0, 1e-12, along)
         shares = []
         for part in range(len(self.points)):
             frame = frames[part] if len(frames) > 1 else frames[0]

@@ -11,7 +11,7 @@ import numpy as np
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.cloud import Cloud, Surface, count_visible, sample_frames, truth
+from sim_assets.cloud import Cloud, Surface, sample_frames, truth, visible_pixels
 from sim_assets.options import Protocol, Sampling
 from sim_assets.renderer import AbstractRenderer, Backend, Frame
 from sim_assets.views import Outline, View, draw_views, generator
@@ -124,9 +124,12 @@ class Shooter:
             )
         else:
             frames = self._frames(state, view)
-            if count_visible(frames) < LEAST_PIXELS:
+            seen = visible_pixels(frames)
+            if sum(len(pixels) for pixels in seen) < LEAST_PIXELS:
                 return None
-            cloud = sample_frames(frames, settings.camera, settings.points, rng, settings.sampling)
+            cloud = sample_frames(
+                frames, seen, settings.camera, settings.points, rng, settings.sampling
+            )
             visible = self.surface.visible(frames, settings.camera, known.camera_T_part)
         per_part = np.bincount(cloud.part, minlength=len(known.camera_T_part))
         if per_part.min() < self.least:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,7 @@ class _Stage:
         for entity in self.parts:
             self.scene.add_entity(entity)
         ids = [entity.per_scene_id for entity in self.parts]
-        self.part_of_id = np.full(max(ids) + 1, BACKGROUND, np.uint8)
+        self.part_of_id = np.full(256, BACKGROUND, np.uint8)
         self.part_of_id[ids] = np.arange(len(ids))
         self.hidden: frozenset[int] = frozenset()
         self.reach = _reach(thing)
@@ -159,10 +160,10 @@ class _Stage:
         self.camera.take_picture()
         position = self.camera.get_picture("Position")
         if not self.color:
-            part = self.part_of_id[position[..., 1].astype(np.intp)]
+            part = self.part_of_id[position[..., 1].astype(np.uint8)]
             return Frame(depth=np.ascontiguousarray(position[..., 0]), part=part)
         entity = self.camera.get_picture("Segmentation")[..., 1]
-        part = self.part_of_id[entity.astype(np.intp)]
+        part = self.part_of_id[entity.astype(np.uint8)]
         depth = np.where(part == BACKGROUND, 0, -position[..., 2]).astype(np.float32)
         color = np.clip(self.camera.get_picture("Color")[..., :3] * 255 + 0.5, 0, 255)
         return Frame(depth=depth, part=part, color=color.astype(np.uint8))
@@ -181,12 +182,12 @@ class _Stage:
 def _entity(visuals: tuple[Visual, ...], color: bool) -> sapien.Entity:
     """A part: a shape per colour, or one for all, which is one draw call."""
     body = RenderBodyComponent()
-    surfaces = [_double_sided(visual.mesh) for visual in visuals]
+    closed = _closed(visuals)
     if color:
-        for surface, visual in zip(surfaces, visuals, strict=True):
-            body.attach(_shape(*surface, visual.color))
+        for visual in visuals:
+            body.attach(_shape([visual], closed, visual.color))
     else:
-        body.attach(_shape(*_merged(surfaces)))
+        body.attach(_shape(visuals, closed))
     entity = sapien.Entity()
     entity.add_component(body)
     return entity
@@ -206,32 +207,32 @@ def _reach(thing: ArticulatedObject) -> float:
     return float(radius.max())
 
 
-def _double_sided(
-    mesh: trimesh.Trimesh,
-) -> tuple[Float[np.ndarray, "V 3"], np.ndarray]:
-    """Vertices and faces, with reversed faces added unless the surface is closed and outward."""
-    faces = np.asarray(mesh.faces)
-    if not (mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0):
-        faces = np.concatenate([faces, faces[:, ::-1]])
-    return np.asarray(mesh.vertices), faces
-
-
-def _merged(
-    surfaces: list[tuple[np.ndarray, np.ndarray]],
-) -> tuple[Float[np.ndarray, "V 3"], np.ndarray]:
-    starts = np.cumsum([0] + [len(vertices) for vertices, _ in surfaces[:-1]])
-    faces = [faces + start for (_, faces), start in zip(surfaces, starts, strict=True)]
-    return np.concatenate([vertices for vertices, _ in surfaces]), np.concatenate(faces)
+def _closed(visuals: Sequence[Visual]) -> bool:
+    """Whether every edge is met once each way and each surface encloses a positive volume."""
+    for visual in visuals:
+        corners, faces = np.asarray(visual.mesh.vertices), np.asarray(visual.mesh.faces)
+        start, end = faces.ravel(), faces[:, (1, 2, 0)].ravel()
+        there, back = (np.sort(a * len(corners) + b) for a, b in ((start, end), (end, start)))
+        if not np.array_equal(there, back) or (there[1:] == there[:-1]).any():
+            return False
+        if np.linalg.det(corners[faces]).sum() <= 0:
+            return False
+    return True
 
 
 def _shape(
-    vertices: Float[np.ndarray, "V 3"],
-    faces: np.ndarray,
-    color: tuple[float, ...] = (0.7, 0.7, 0.7, 1.0),
+    visuals: Sequence[Visual], closed: bool, color: tuple[float, ...] = (0.7, 0.7, 0.7, 1.0)
 ) -> RenderShapeTriangleMesh:
+    """Surfaces as one shape, with all faces once more the other way round unless closed."""
+    starts = np.cumsum([0] + [len(visual.mesh.vertices) for visual in visuals[:-1]])
+    faces = np.concatenate(
+        [visual.mesh.faces + start for visual, start in zip(visuals, starts, strict=True)]
+    )
+    if not closed:
+        faces = np.concatenate([faces, faces[:, ::-1]])
+    points = np.concatenate([visual.mesh.vertices for visual in visuals]).astype(np.float32)
     material = RenderMaterial()
     material.base_color = list(color)
-    points = vertices.astype(np.float32)
     return RenderShapeTriangleMesh(
         vertices=points,
         triangles=faces.astype(np.uint32),

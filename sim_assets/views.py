@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import radians
 
 import numpy as np
 from jaxtyping import Float
@@ -104,10 +104,11 @@ def draw_views(
 
 def draw_direction(window: Window, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
     """Unit vector from the object to the camera, uniform on the window's piece of the sphere."""
-    azimuth = radians(rng.uniform(*window.azimuth))
-    z = rng.uniform(*np.sin(np.radians(window.elevation)))
-    level = np.sqrt(1 - z * z)
-    return np.array([-level * np.cos(azimuth), -level * np.sin(azimuth), z])
+    azimuth = math.radians(rng.uniform(*window.azimuth))
+    low, high = (math.sin(math.radians(angle)) for angle in window.elevation)
+    z = rng.uniform(low, high)
+    level = math.sqrt(1 - z * z)
+    return np.array([-level * math.cos(azimuth), -level * math.sin(azimuth), z])
 
 
 def direction_angles(direction: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 2"]:
@@ -119,13 +120,15 @@ def direction_angles(direction: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, 
 
 def look_along(gaze: Float[np.ndarray, " 3"], roll: float) -> Float[np.ndarray, "3 3"]:
     """Rotation to a camera frame with z along `gaze`, x level, then rolled about z."""
-    level = np.cross(gaze, [0.0, 0.0, 1.0])
-    if np.linalg.norm(level) < 1e-6:
-        level = np.array([0.0, -1.0, 0.0])  # straight down or up: x to the object's right
-    x = level / np.linalg.norm(level)
-    y = np.cross(gaze, x)
-    c, s = np.cos(roll), np.sin(roll)
-    return np.stack([c * x + s * y, c * y - s * x, gaze])
+    gx, gy, gz = gaze.tolist()
+    length = math.hypot(gx, gy)
+    # Straight down or up: x to the object's right.
+    x = (gy / length, -gx / length, 0.0) if length > 1e-6 else (0.0, -1.0, 0.0)
+    y = (-gz * x[1], gz * x[0], gx * x[1] - gy * x[0])  # gaze cross x
+    c, s = math.cos(roll), math.sin(roll)
+    first = [c * a + s * b for a, b in zip(x, y, strict=True)]
+    second = [c * b - s * a for a, b in zip(x, y, strict=True)]
+    return np.array([first, second, [gx, gy, gz]])
 
 
 def frame_objects(
@@ -212,7 +215,8 @@ def _turn(
     """The smallest rotation between two directions less than half a turn apart (Rodrigues)."""
     a = source / np.sqrt((source**2).sum(-1, keepdims=True))
     b = target / np.sqrt((target**2).sum(-1, keepdims=True))
-    x, y, z = np.cross(a, b).T
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx  # a cross b
     zero = np.zeros_like(x)
     skew = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     factor = 1 / (1 + (a * b).sum(-1))

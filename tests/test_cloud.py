@@ -11,14 +11,16 @@ from scapo.camera import Intrinsics
 from scapo.geometry import joint_motion
 from sim_assets.cloud import (
     TOLERANCE,
+    Cloud,
     Surface,
     choose,
     choose_far,
-    count_visible,
     sample_frames,
     sample_surface,
     truth,
+    visible_pixels,
 )
+from sim_assets.options import Sampling
 from sim_assets.raycast import RaycastRenderer
 from sim_assets.renderer import BACKGROUND, Frame
 from sim_assets.views import Outline, draw_views, generator
@@ -40,6 +42,10 @@ def picture(thing, state: float, pose: np.ndarray) -> Frame:
         return renderer.render(np.array([state]), pose, CAMERA)
 
 
+def draw(frames: list[Frame], count: int, sampling: Sampling = "random") -> Cloud:
+    return sample_frames(frames, visible_pixels(frames), CAMERA, count, generator("draw"), sampling)
+
+
 def test_truth_follows_the_joint():
     thing = laptop()
     (view,) = draw_views(Outline(thing), [generator("truth")], CAMERA)
@@ -55,7 +61,7 @@ def test_truth_follows_the_joint():
 def test_sampled_points_are_the_pixels_surface_points():
     thing = laptop(thickness=0.02)
     frame = picture(thing, 0.0, above(0.5))
-    cloud = sample_frames([frame], CAMERA, 500, generator("points"))
+    cloud = draw([frame], 500)
     np.testing.assert_allclose(cloud.points[:, 2], 0.48, atol=1e-7)
     assert (np.abs(cloud.points[:, 0]) <= 0.18).all()
     assert (np.abs(cloud.points[:, 1]) <= 0.125).all()
@@ -70,14 +76,15 @@ def test_pictures_of_single_parts_are_merged():
     with RaycastRenderer(color=True) as renderer:
         renderer.open(thing)
         frames = [renderer.render(np.array([0.0]), above(0.5), CAMERA, part) for part in (0, 1)]
-    cloud = sample_frames(frames, CAMERA, 2000, generator("isolated"))
+    cloud = draw(frames, 2000)
     # Closed, each part is as large in the image as the other, though only one would be seen.
     assert abs((cloud.part == 0).mean() - 0.5) < 0.06
     np.testing.assert_allclose(cloud.points[cloud.part == 0, 2], 0.5, atol=1e-6)
     np.testing.assert_allclose(cloud.points[cloud.part == 1, 2], 0.48, atol=1e-6)
     assert cloud.color is not None
     assert (cloud.color == 179).all()
-    assert count_visible(frames) == sum((frame.part != BACKGROUND).sum() for frame in frames)
+    pixels = visible_pixels(frames)
+    assert [len(seen) for seen in pixels] == [(f.part != BACKGROUND).sum() for f in frames]
 
 
 def test_fewer_pixels_than_points_are_drawn_with_replacement():
@@ -98,7 +105,7 @@ def test_farthest_points_are_spread():
 
     assert least(far) > 3 * least(near)
     assert len(choose_far(points[:20], 30, rng)) == 30
-    cloud = sample_frames([picture(laptop(), 1.0, above(0.6))], CAMERA, 64, rng, "fps")
+    cloud = draw([picture(laptop(), 1.0, above(0.6))], 64, "fps")
     assert least(cloud.points.astype(float)) > 0.01
 
 
