@@ -17,6 +17,7 @@ from bench.prepare import Prepared, Request, fit_frames, open_data
 from bench.report import summarise
 from bench.score_files import Run, side_file, write_report, write_rows, writing
 from bench.scores import Errors, Rows, Settings, score
+from bench.statistics import BOOTSTRAP_SEED
 from bench.truth import Truth, blocks
 from scapo.store import Split, sha256_file
 
@@ -129,6 +130,11 @@ def _report(
             "unanswered": dict(sorted(predictions.unanswered.items())),
         },
         "calibration": fitted.record,
+        "seeds": {
+            "training": header.seed,
+            "calibration": None if fitted.record is None else fitted.record.get("seed"),
+            "bootstrap": BOOTSTRAP_SEED,
+        },
         "part_order": None if fitted.order is None else fitted.order.tolist(),
         "digests": {
             "data": split.manifest.digest,

@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,20 @@ STRATA_COLUMNS = ("factor", "lower", "upper", "metric", "unit", "samples", "mean
 LADDER_COLUMNS = ("rung", "metric", "unit", "mean", "low", "high", "n", "undefined")
 
 
-def explain(request: Request) -> list[Path]:
-    """Write `strata.{csv,png}` and `ladder.{csv,png}` to the folder `request.out`.
+Ladder = dict[Rung, dict[tuple[str, str], Interval]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explanation:
+    """What `explain` found."""
+
+    title: str
+    strata: tuple[Stratum, ...]
+    ladder: Ladder
+
+
+def measure(request: Request) -> Explanation:
+    """Strata and ladder of a predictions file.
 
     Raises:
         StoreError: As `evaluate`.
@@ -39,8 +52,9 @@ def explain(request: Request) -> list[Path]:
         fitted = fit_frames(request, header, split, predictions)
         for truth in blocks(split):
             rows = predictions.rows(truth.first, len(truth))
-            climbed = climb(truth, rows, settings=request.settings, frames=fitted.frames,
-                            order=fitted.order)  # fmt: skip
+            climbed = climb(
+                truth, rows, settings=request.settings, frames=fitted.frames, order=fitted.order
+            )
             for rung, errors in climbed.items():
                 rungs[rung].append(errors)
             seen.append(factors(truth, split.manifest))
@@ -49,16 +63,34 @@ def explain(request: Request) -> list[Path]:
     instance = np.concatenate(instances)
     joined: dict[Rung, Errors] = {rung: _joined(found) for rung, found in rungs.items()}
     values = {name: np.concatenate([block[name] for block in seen]) for name in seen[0]}
-    strata = list(stratify(joined["predicted"], values, instance))
-    ladder: dict[Rung, dict[tuple[str, str], Interval]] = {rung: {key: interval(table, instance) for key, table in errors.items()}
-              for rung, errors in joined.items()}  # fmt: skip
-    title = f"{header.method} {header.variant} {header.category} {header.split}".replace("  ", " ")
-    out = request.out
-    write_bytes(out / "strata.csv", _strata_csv(strata).encode())
-    write_bytes(out / "ladder.csv", _ladder_csv(ladder).encode())
-    write_bytes(out / "strata.png", plot_strata(strata, title))
-    write_bytes(out / "ladder.png", plot_ladder(ladder, title))
-    return [out / name for name in ("ladder.csv", "ladder.png", "strata.csv", "strata.png")]
+    ladder: Ladder = {
+        rung: {key: interval(table, instance) for key, table in errors.items()}
+        for rung, errors in joined.items()
+    }
+    words = (header.method, header.variant, header.category, header.split)
+    return Explanation(
+        title=" ".join(word for word in words if word),
+        strata=tuple(stratify(joined["predicted"], values, instance)),
+        ladder=ladder,
+    )
+
+
+def explain(request: Request) -> list[Path]:
+    """Write `strata.{csv,png}` and `ladder.{csv,png}` to the folder `request.out`.
+
+    Raises:
+        StoreError: As `evaluate`.
+    """
+    found = measure(request)
+    contents = {
+        "ladder.csv": _ladder_csv(found.ladder).encode(),
+        "ladder.png": plot_ladder(found.ladder, found.title),
+        "strata.csv": _strata_csv(found.strata).encode(),
+        "strata.png": plot_strata(found.strata, found.title),
+    }
+    for name, data in contents.items():
+        write_bytes(request.out / name, data)
+    return [request.out / name for name in contents]
 
 
 def _joined(found: list[Errors]) -> Errors:
@@ -86,7 +118,7 @@ def _strata_csv(strata: Iterable[Stratum]) -> str:
     ))  # fmt: skip
 
 
-def _ladder_csv(ladder: dict[Rung, dict[tuple[str, str], Interval]]) -> str:
+def _ladder_csv(ladder: Ladder) -> str:
     return _csv(LADDER_COLUMNS, (
         (rung, metric, unit, *_fields(value))
         for rung, values in ladder.items() for (metric, unit), value in values.items()

@@ -31,7 +31,11 @@ def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
     """A row per metric, a column per factor; bars with 95 % intervals, the count below each."""
     metrics = [key for key in LABELS if any((s.metric, s.unit) == key for s in strata)]
     names = [name for name in FACTORS if any(s.factor == name for s in strata)]
-    figure = Figure(figsize=(3.4 * len(names), 2.2 * len(metrics) + 0.6), layout="constrained")
+    height = 2.3 * len(metrics) + 0.8
+    figure = Figure(figsize=(3.2 * len(names), height))
+    figure.subplots_adjust(
+        left=0.06, right=0.99, bottom=0.5 / height, top=1 - 0.8 / height, wspace=0.25, hspace=0.5
+    )
     grid = figure.subplots(len(metrics), len(names), squeeze=False)
     for row, key in enumerate(metrics):
         for column, name in enumerate(names):
@@ -52,7 +56,8 @@ def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
 def plot_ladder(ladder: dict[Rung, dict[tuple[str, str], Interval]], title: str) -> bytes:
     """A panel per metric, a bar per rung."""
     metrics = [key for key in LABELS if key in ladder["predicted"]]
-    figure = Figure(figsize=(3.2 * len(metrics), 3.2), layout="constrained")
+    figure = Figure(figsize=(3.2 * len(metrics), 3.4))
+    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.24, top=0.83, wspace=0.25)
     grid = figure.subplots(1, len(metrics), squeeze=False)
     for axes, key in zip(grid[0], metrics, strict=True):
         _bars(axes, [values[key] for values in ladder.values()], list(ladder), turned=True)

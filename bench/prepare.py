@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from bench.calibration import CALIBRATION_SPLIT, Fitted, check_calibration, dataset_order, fit
+from bench.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.compat_files import Canon, check_record, fit_canon
 from bench.predictions import Header, Predictions, read_prediction_header
 from bench.scores import Frames, Settings
@@ -52,9 +52,27 @@ def open_data(request: Request) -> tuple[Header, Split]:
             f"{request.predictions}: header field 'split': expected "
             f"{request.split!r}, found {header.split!r}"
         )
-    split = open_split(request.data, header.category, request.split)
-    split.verify()
-    return header, split
+    return header, find_data(request.data, header)
+
+
+def find_data(folder: Path, header: Header) -> Split:
+    """The split that a header names, its bytes verified.
+
+    Where several data sets below `folder` have that category and split (the benchmark's `clean`
+    and `sensor` both have laptops), the digest decides.
+
+    Raises:
+        StoreError: Not found, not unique, or changed shards.
+    """
+    pattern = f"*/{header.category}/{header.split}/manifest.json"
+    candidates = [Split(path.parent) for path in sorted(folder.glob(pattern))]
+    fitting = [split for split in candidates if split.manifest.digest == header.data_digest]
+    if len(candidates) > 1 and len(fitting) == 1:
+        found = fitting[0]
+    else:
+        found = open_split(folder, header.category, header.split)
+    found.verify()
+    return found
 
 
 def fit_frames(
@@ -76,9 +94,9 @@ def fit_frames(
             order = dataset_order(predictions, split)
         return Prepared(frames=frames, order=order)
     path = request.calibration
-    check_calibration(path, read_prediction_header(path), header)
-    train = open_split(request.data, header.category, CALIBRATION_SPLIT)
-    train.verify()
+    trained = read_prediction_header(path)
+    check_calibration(path, trained, header)
+    train = find_data(request.data, trained)
     fitted = fit(path, train, settings=request.settings, frames=frames)
     record = fitted.record() | {"sha256": sha256_file(path), "data": train.manifest.digest}
     canon = None

@@ -100,7 +100,8 @@ def _draws(instances: int, resamples: int, seed: int) -> Int[np.ndarray, "R I"]:
 
 def _ratio(
     draws: Int[np.ndarray, "R I"], total: Float[np.ndarray, " I"], count: Float[np.ndarray, " I"]
-) -> Float[np.ndarray, " R"]:
+) -> Float[np.ndarray, " Q"]:
+    """Means of the resamples that hold a value."""
     size = draws @ count
     means = np.divide(draws @ total, size, out=np.full(len(size), np.nan), where=size > 0)
     return means[np.isfinite(means)]

@@ -89,7 +89,7 @@ def perturbed(arrays):
     pose, axis = out["camera_T_part"], out["joint_axis"]
     turn = Rotation.from_rotvec(np.radians(7) * unit((pose[..., 0, 0].size, 3))).as_matrix()
     pose[..., :3, :3] = pose[..., :3, :3] @ turn.reshape(pose[..., :3, :3].shape)
-    pose[..., :3, 3] += 0.03 * unit(pose.shape[:2] + (3,))
+    pose[..., :3, 3] += 0.03 * unit((*pose.shape[:2], 3))
     tilt = Rotation.from_rotvec(np.radians(7) * across(axis).reshape(-1, 3))
     out["joint_pivot"] = out["joint_pivot"] + 0.03 * across(axis) + 0.4 * axis
     out["joint_axis"] = -5 * tilt.apply(axis.reshape(-1, 3)).reshape(axis.shape)
@@ -382,6 +382,28 @@ def test_names_of_data(tmp_path):
         assert name == f"{expected}@{split.manifest.digest[:12]}"
 
 
+def test_the_digest_tells_two_benchmarks_apart(tmp_path):
+    """`clean` and `sensor` both have laptops: the predictions say which were predicted."""
+    for name, points in (("clean", 30), ("sensor", 40)):
+        split = made.make_data(tmp_path / "set" / name, "laptop", count=4, points=points)
+        path = made.write_truth(tmp_path / f"{name}.safetensors", split)
+        train = Split(split.folder.parent / "train")
+        calibration = made.write_truth(tmp_path / f"{name}-train.safetensors", train)
+        report = evaluate(
+            Request(
+                predictions=path,
+                data=tmp_path / "set",
+                out=tmp_path / f"{name}.csv.gz",
+                calibration=calibration,
+            )
+        )
+        assert report["data"].startswith(f"{name}@")
+        assert report["summary"]["iou_1"]["mean"] == 1
+    other = made.write_truth(tmp_path / "o.safetensors", split, data_digest="2" * 64)
+    with pytest.raises(StoreError, match="expected"):
+        evaluate(Request(predictions=other, data=tmp_path / "set", out=tmp_path / "o.csv.gz"))
+
+
 def test_a_changed_shard_is_refused(tmp_path):
     split = made.make_data(tmp_path / "data", "laptop", count=6)
     path = made.write_truth(tmp_path / "p.safetensors", split)
@@ -390,7 +412,7 @@ def test_a_changed_shard_is_refused(tmp_path):
     data[-5] ^= 1
     shard.write_bytes(data)
     request = Request(predictions=path, data=tmp_path / "data", out=tmp_path / "s.csv.gz")
-    with pytest.raises(StoreError, match="00001.safetensors: expected sha256"):
+    with pytest.raises(StoreError, match=r"00001\.safetensors: expected sha256"):
         evaluate(request)
 
 
