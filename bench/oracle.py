@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Methods that need labels at test time, such as ICP given true parts: declared by their type."""
+"""Methods that can be given labels at test time, such as ICP with true parts: declared by type."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from scapo.types import Labels, Observation, Prediction, Supervision
 
 
 class OracleMethod(AbstractMethod):
-    """A method that `predict` shows true labels of the test split.
+    """A method that can also answer with true labels of the test split in hand.
 
-    What it sees is `labels.keep(oracle)`, no more; `variant` must name it, so that the row of
-    every table says so, and the predictions file lists it under `budget.oracle`.
+    Only `predict --oracle` shows it any, and only `labels.keep(oracle)`. The predictions file then
+    says `oracle-...` in its variant, and so does the row of every table.
     """
 
     oracle: frozenset[Supervision]
+    """The labels that it can use."""
 
     @abstractmethod
     def predict_given(self, observation: Observation, labels: Labels) -> Prediction:

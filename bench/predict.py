@@ -42,6 +42,9 @@ class Predict:
     """Split to predict."""
     mode: Mode = "fast"
     """fast: networks only; refine: with optimisation at test time."""
+    oracle: bool = False
+    """Show a method that can use them true labels of the test split (icp: the parts); the
+    variant then begins with oracle."""
     device: str = "auto"
     """auto (CUDA where there is a GPU), cpu, cuda, ..."""
     batch: int = 32
@@ -52,16 +55,17 @@ class Predict:
         method, header = load(self.checkpoint)
         device = pick_device(self.device)
         method.to(device)
+        oracle = self._oracle_words(method)
         split = open_split(self.data, header["category"], self.split)
         samples = SampleDataset(split)
         batches = torch.arange(len(samples)).split(self.batch)
         started = time.perf_counter()
         arrays = [
-            answer(method, samples, index, device, self.mode)
+            self._answer(method, samples, index, device)
             for index in track(batches, description="predict", console=console)
         ]
         seconds = (time.perf_counter() - started) / len(samples)
-        words = [method.variant, "" if self.mode == "fast" else self.mode]
+        words = [method.variant, "" if self.mode == "fast" else self.mode, *oracle]
         write_predictions(
             self.out,
             Header(
@@ -78,7 +82,6 @@ class Predict:
                     "steps": header["steps"],
                     **timing(self.checkpoint),
                     "seconds_per_cloud": round(seconds, 5),
-                    "oracle": sorted(method.oracle) if isinstance(method, OracleMethod) else [],
                 },
             ),
             {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]},
@@ -87,6 +90,29 @@ class Predict:
             f"{len(samples)} clouds, {1000 * seconds:.1f} ms each: {self.out}", soft_wrap=True
         )
 
+    def _oracle_words(self, method: AbstractMethod) -> list[str]:
+        """What the variant says of labels at test time.
+
+        Raises:
+            ValueError: The method cannot use any.
+        """
+        if not self.oracle:
+            return []
+        if not isinstance(method, OracleMethod):
+            raise ValueError(f"--oracle: expected a method that takes one, found {method.name}")
+        return [f"oracle-{'-'.join(sorted(method.oracle))}"]
+
+    def _answer(
+        self, method: AbstractMethod, samples: SampleDataset, index: torch.Tensor, device: str
+    ) -> Arrays:
+        """The tensors of a predictions file for the samples of `index`."""
+        batch = samples.batch(index)
+        observation = Observation(points=observe(batch).points.to(device))
+        if self.oracle and isinstance(method, OracleMethod):
+            labels = map_labels(label(batch).keep(method.oracle), lambda tensor: tensor.to(device))
+            return to_arrays(method.predict_given(observation, labels))
+        return to_arrays(method.predict(observation, self.mode))
+
 
 def timing(run: Path) -> dict[str, Any]:
     """Seconds of training, where the run folder is at hand."""
@@ -94,22 +120,6 @@ def timing(run: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     return {"training_seconds": round(json.loads(path.read_text())["seconds"], 1)}
-
-
-def answer(
-    method: AbstractMethod, samples: SampleDataset, index: torch.Tensor, device: str, mode: Mode
-) -> Arrays:
-    """The tensors of a predictions file for the samples of `index`.
-
-    Only a method that declares an oracle is shown labels, those it declares; its header and its
-    row in the tables say so.
-    """
-    batch = samples.batch(index)
-    observation = Observation(points=observe(batch).points.to(device))
-    if isinstance(method, OracleMethod):
-        labels = map_labels(label(batch).keep(method.oracle), lambda tensor: tensor.to(device))
-        return to_arrays(method.predict_given(observation, labels))
-    return to_arrays(method.predict(observation, mode))
 
 
 def to_arrays(prediction: Prediction) -> Arrays:
