@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The object frame of a model: z up, front towards -x, metres, centre of the box at rest.
 
-Where neither the caller nor the source says where the front is, it is told from the joint:
+Where the caller does not say where the front is, it is told from the joint. The source's own front
+goes before, unless a door or drawer plainly (within 26 degrees) opens another way:
 
-- a door or drawer: where it moves to when it begins to open; a lid that opens upwards: from its
-  hinge towards its middle, as a laptop's user sits opposite to the hinge;
+- a door or drawer: where it moves to when it begins to open;
+- a lid, also a washer's that opens upwards: from its hinge towards its middle, as a laptop's user
+  sits opposite to the hinge;
 - eyeglasses: from the temples' middles to their hinges;
 - basket: along the handles' hinges, so that these run along x (of the two ends the one nearer to
   the root link's -x or -y), whatever the source says;
@@ -20,6 +22,7 @@ somebody who looks at its front: +y.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +32,8 @@ from scapo.types import Category
 from sim_assets.validate import Repairs, refuse
 
 AXES = ("x", "y", "z")
+SURE = 0.9
+"""Cosine of the angle to an axis of the root link up to which a door's motion tells the front."""
 ABSURD = 4.0
 """A metric model larger or smaller than its category's nominal diagonal by this is rescaled."""
 
@@ -72,13 +77,23 @@ def snapped(vector: Vector, up: Vector) -> Vector:
     return np.sign(level[k] or 1.0) * np.eye(3)[k]
 
 
-def infer_front(
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ToldFront:
+    """A front that was told from the joint."""
+
+    front: Vector
+    """One of the root link's axes."""
+    sure: bool
+    """Whether it holds against what is usual in the model's set."""
+
+
+def told_front(
     category: Category,
     up: Vector,
     pivot: Float[np.ndarray, "J 3"],
     axis: Float[np.ndarray, "J 3"],
     middle: Float[np.ndarray, "J 3"],
-) -> Vector:
+) -> ToldFront:
     """Where a model's front is, by the rules above.
 
     Args:
@@ -88,18 +103,22 @@ def infer_front(
         axis: Unit; positive motion opens.
         middle: Centre of each moving part at rest.
     """
-    if category.joints[0].kind == "prismatic":
-        return snapped(axis[0], up)
     if category.rest == "tallest":
         along = snapped(axis[0], up)
-        return -along if along.sum() > 0 else along
+        return ToldFront(front=-along if along.sum() > 0 else along, sure=True)
+    if category.joints[0].kind == "prismatic":
+        front = snapped(axis[0], up)
+        return ToldFront(front=front, sure=bool(axis[0] @ front > SURE))
     if len(category.joints) > 1:
-        return snapped((pivot - middle).mean(0), up)
-    motion = np.cross(axis[0], middle[0] - pivot[0])
+        return ToldFront(front=snapped((pivot - middle).mean(0), up), sure=False)
+    arm = middle[0] - pivot[0]
+    motion = np.cross(axis[0], arm)
     level = motion - up * (motion @ up)
-    if np.linalg.norm(level) > 0.5 * np.linalg.norm(motion):
-        return snapped(level, up)
-    return snapped(middle[0] - pivot[0] - axis[0] * (axis[0] @ (middle[0] - pivot[0])), up)
+    door = "door" in category.words
+    if door and np.linalg.norm(level) > 0.5 * np.linalg.norm(motion):
+        front = snapped(level, up)
+        return ToldFront(front=front, sure=bool(motion @ front > SURE * np.linalg.norm(motion)))
+    return ToldFront(front=snapped(arm - axis[0] * (axis[0] @ arm), up), sure=False)
 
 
 def left(category: Category) -> Vector:

@@ -181,20 +181,21 @@ def _rotation(
     wanted: tuple[str | None, str | None],
     repairs: Repairs,
 ) -> Float[np.ndarray, "3 3"]:
-    """object_R_asset: by the caller, then the source, then the joint."""
+    """object_R_asset: by the caller, then a joint that is sure, then the source, then the joint."""
     path, known = resting.model.robot.path, resting.model.known
     upward = frames.direction(wanted[0] or known.up, path)
-    by_source = wanted[0] is None and category.rest != "tallest"
-    given = wanted[1] or (known.front if by_source else None)
     if category.name == "scissors":
         return _along_blades(resting, upward, wanted[1])
-    if given is not None:
-        return frames.basis(upward, frames.direction(given, path), path)
+    if wanted[1] is not None:
+        return frames.basis(upward, frames.direction(wanted[1], path), path)
     middle = resting.bounds(np.eye(3))[1:].mean(1)
-    front = frames.infer_front(category, upward, resting.pivot, resting.axis, middle)
-    if frames.name_of(front) != "-x":
-        repairs.add(f"The front was told from the joint: {frames.name_of(front)}")
-    return frames.basis(upward, front, path)
+    told = frames.told_front(category, upward, resting.pivot, resting.axis, middle)
+    usual = frames.direction(known.front or "-x", path)
+    if known.front is not None and wanted[0] is None and not told.sure:
+        return frames.basis(upward, usual, path)
+    if not np.array_equal(told.front, usual):
+        repairs.add(f"The front was told from the joint: {frames.name_of(told.front)}")
+    return frames.basis(upward, told.front, path)
 
 
 def _along_blades(resting: _Resting, upward: Vector, front: str | None) -> Float[np.ndarray, "3 3"]:

@@ -15,31 +15,7 @@ from sim_assets import frames, reader, rest
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.reduce import words
 from sim_assets.validate import AssetError
-
-MESH = '<geometry><mesh filename="meshes/{0}.stl"/></geometry>'
-LINK = f'<link name="{{0}}"><visual>{MESH}</visual></link>'
-
-
-def write(folder: Path, links: dict[str, trimesh.Trimesh], joints: str) -> Path:
-    (folder / "meshes").mkdir(parents=True)
-    for name, mesh in links.items():
-        mesh.export(folder / f"meshes/{name}.stl")
-    path = folder / "model.urdf"
-    path.write_text(f'<robot name="r">{"".join(map(LINK.format, links))}{joints}</robot>')
-    return path
-
-
-def joint(name: str, ends: tuple[str, str], origin: str, axis: str, limit: str) -> str:
-    kind = "prismatic" if "slide" in name else "revolute"
-    lower, upper = limit.split()
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{ends[0]}"/><child link="{ends[1]}"/>'
-        f'<origin {origin}/><axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}"/></joint>'
-    )
-
-
-def box(size: tuple[float, ...], centre: tuple[float, ...]) -> trimesh.Trimesh:
-    return trimesh.creation.box(size).apply_translation(centre)
+from tests.urdfs import box, joint, write
 
 
 def blades() -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
@@ -205,6 +181,52 @@ def test_mimics_are_followed_at_rest(tmp_path: Path):
     assert thing.origin.joint_names == ("a",)
     assert thing.origin.rest == pytest.approx({"a": -0.8, "b": 0.8})
     np.testing.assert_allclose(thing.extents(), (0.32, 0.6, 0.6), atol=1e-6)
+
+
+def partnet(folder: Path, joints: str) -> Path:
+    """A cabinet in PartNet-Mobility's layout: y up, front towards z, an empty root."""
+    links = {"link_0": box((1, 1, 1), (0, 0, 0)), "link_1": box((0.8, 0.2, 0.9), (0, 0, 0))}
+    root = (
+        '<link name="base"/><joint name="root" type="fixed"><parent link="base"/>'
+        f'<child link="link_0"/><origin rpy="{pi / 2} 0 {-pi / 2}"/></joint>'
+    )
+    path = write(folder, links, root + joints)
+    (folder / "semantics.txt").write_text("link_0 heavy furniture_body\nlink_1 slider drawer\n")
+    return path
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_partnet_frame_and_size(named: bool, tmp_path: Path):
+    joints = joint("slide", ("link_0", "link_1"), 'xyz="0 0 0.05"', "0 0 1", "0 0.7")
+    path = partnet(tmp_path, joints)
+    if not named:
+        (tmp_path / "semantics.txt").unlink()
+    thing = reader.read(path, "drawer")
+    np.testing.assert_allclose(thing.axis, [[-1, 0, 0]], atol=1e-12)
+    diagonal = np.linalg.norm(thing.extents())
+    assert diagonal == pytest.approx(thing.category.diagonal)
+    np.testing.assert_allclose(thing.upper, 0.7 * diagonal / np.sqrt(3))
+    assert thing.origin.repairs == ()
+
+
+def test_partnet_drawer_at_another_side(tmp_path: Path):
+    """The drawer faces -x even where the model's usual front does not have it."""
+    joints = joint("slide", ("link_0", "link_1"), 'xyz="0.1 0 0"', "1 0 0", "0 0.7")
+    thing = reader.read(partnet(tmp_path, joints), "drawer")
+    np.testing.assert_allclose(thing.axis, [[-1, 0, 0]], atol=1e-12)
+    assert thing.origin.repairs == ("The front was told from the joint: -y",)
+    asked = reader.read(partnet(tmp_path / "b", joints), "drawer", front="-x")
+    np.testing.assert_allclose(asked.axis, [[0, -1, 0]], atol=1e-12)
+
+
+def test_geared_temples(tmp_path: Path):
+    """A temple that mimics the other is a joint of its own where the category needs two."""
+    path = glasses(tmp_path, zero=0.0, front=-1.0)
+    text = path.read_text()
+    k = text.rindex("</joint>")
+    path.write_text(f'{text[:k]}<mimic joint="one_hinge"/>{text[k:]}')
+    thing = reader.read(path, "eyeglasses")
+    assert set(thing.origin.joint_names) == {"one_hinge", "two_hinge"}
 
 
 @pytest.mark.parametrize(

@@ -206,6 +206,16 @@ def test_one_handle_is_no_basket(shared_dir: Path):
         reader.read(root / "bucket/100454/mobility.urdf", "basket", root=root)
 
 
+def test_partnet_models_keep_their_frame(models: Models):
+    """After the set's fixed joint z is up and the front faces -x: only the scale is ours."""
+    for name, (urdf, thing) in models.items():
+        plain = thing.category.name not in ("scissors", "washer")
+        if (urdf.parent / "semantics.txt").exists() and plain:
+            similarity = thing.origin.object_T_asset[:3, :3]
+            scaled = similarity / np.cbrt(np.linalg.det(similarity))
+            np.testing.assert_allclose(scaled, np.eye(3), atol=1e-9, err_msg=name)
+
+
 def test_overrides(shared_dir: Path):
     """A fridge modelled with y up stands when told so."""
     urdf = shared_dir / "assets/fridge/habitat_fridge/fridge.urdf"

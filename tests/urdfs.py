@@ -52,3 +52,29 @@ def cabinet(folder: Path, *changes: tuple[str, str]) -> Path:
     path = folder / "cabinet.urdf"
     path.write_text(text)
     return path
+
+
+MESH = '<geometry><mesh filename="meshes/{0}.stl"/></geometry>'
+LINK = f'<link name="{{0}}"><visual>{MESH}</visual></link>'
+
+
+def write(folder: Path, links: dict[str, trimesh.Trimesh], joints: str) -> Path:
+    (folder / "meshes").mkdir(parents=True)
+    for name, mesh in links.items():
+        mesh.export(folder / f"meshes/{name}.stl")
+    path = folder / "model.urdf"
+    path.write_text(f'<robot name="r">{"".join(map(LINK.format, links))}{joints}</robot>')
+    return path
+
+
+def joint(name: str, ends: tuple[str, str], origin: str, axis: str, limit: str) -> str:
+    kind = "prismatic" if "slide" in name else "revolute"
+    lower, upper = limit.split()
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{ends[0]}"/><child link="{ends[1]}"/>'
+        f'<origin {origin}/><axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}"/></joint>'
+    )
+
+
+def box(size: tuple[float, ...], centre: tuple[float, ...]) -> trimesh.Trimesh:
+    return trimesh.creation.box(size).apply_translation(centre)

@@ -8,24 +8,22 @@ normalised, not metres (RENDERING 8).
 from __future__ import annotations
 
 import json
+from math import pi
 from pathlib import Path
 
-from sim_assets.robot import Robot
+import numpy as np
+
+from sim_assets.robot import Robot, transform
 from sim_assets.sources import Traits
 
 MAX_BYTES = 4 << 20
 
 
 def traits(robot: Robot) -> Traits | None:
-    """Of a model of this set, else None: told by the robot's name or the files beside it."""
+    """Of a model of this set, else None."""
     folder = robot.path.parent
     semantics = folder / "semantics.txt"
-    ours = robot.name.startswith("partnet_") or (
-        "base" in robot.links
-        and not robot.links["base"].shapes
-        and (semantics.is_file() or (folder / "mobility_v2.json").is_file())
-    )
-    if not ours:
+    if not _is_ours(robot):
         return None
     labels, files = _semantics(semantics)
     return Traits(
@@ -36,6 +34,19 @@ def traits(robot: Robot) -> Traits | None:
         remark=_remark(folder / "mobility_v2.json"),
         files=files,
     )
+
+
+def _is_ours(robot: Robot) -> bool:
+    """By the robot's name, or an empty root `base` with the set's files or its fixed joint."""
+    if robot.name.startswith("partnet_"):
+        return True
+    if robot.root != "base" or robot.links["base"].shapes:
+        return False
+    if any((robot.path.parent / name).is_file() for name in ("semantics.txt", "mobility_v2.json")):
+        return True
+    first = [joint for joint in robot.joints.values() if joint.parent == "base"]
+    turn = transform((0.0, 0.0, 0.0), (pi / 2, 0.0, -pi / 2))
+    return len(first) == 1 and np.allclose(first[0].parent_T_joint, turn, atol=1e-6)
 
 
 def _semantics(path: Path) -> tuple[dict[str, str], tuple[Path, ...]]:
