@@ -171,62 +171,96 @@ class Explanation:
     template_weights: Float[Tensor, "B M P"]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Deformations:
+    """Both shapes carried through the spaces of Sec. 3.2."""
+
+    canonical: Float[Tensor, "B N 3"]
+    """S*."""
+    canonical_keypoints: Float[Tensor, "B P 3"]
+    """K*: the bone maps applied to K_x."""
+    canonical_weights: Float[Tensor, "B N P"]
+    """w*, evaluated on S* anew; the cycle itself reuses w."""
+    returned: Float[Tensor, "B N 3"]
+    """S^_obj."""
+    template_returned: Float[Tensor, "B M 3"]
+    """Y^_X."""
+    x2y: Float[Tensor, "B N 3"]
+    y2x: Float[Tensor, "B M 3"]
+    gap: Float[Tensor, ""]
+    """How far the maps of the base through its joints disagree."""
+
+
+def deform_all(e: Explanation, bones: Bones, kinds: tuple[JointKind, ...]) -> Deformations:
+    """Apply D^{o->c}, D^{c->o}, D^{X->Y} and D^{Y->X}."""
+    own = part_maps(incident_maps(e.joints, kinds))
+    canonical = to_canonical(own, e.aligned, e.weights)
+    keypoints = apply(invert(own), e.keypoints[:, :, None])[:, :, 0]
+    template_own = part_maps(incident_maps(e.template_joints, kinds))
+    template_canonical = to_canonical(template_own, e.template, e.template_weights)
+    to_template = cross_maps(e.joints, e.template_joints, kinds)
+    to_aligned = cross_maps(e.template_joints, e.joints, kinds)
+    return Deformations(
+        canonical=canonical,
+        canonical_keypoints=keypoints,
+        canonical_weights=bones.weights(canonical, keypoints),
+        returned=deform(own, canonical, e.weights),
+        template_returned=deform(template_own, template_canonical, e.template_weights),
+        x2y=deform(part_maps(to_template), e.aligned, e.weights),
+        y2x=deform(part_maps(to_aligned), e.template, e.template_weights),
+        gap=base_gap(to_template, e.aligned, e.weights)
+        + base_gap(to_aligned, e.template, e.template_weights),
+    )
+
+
 def articulation(
     e: Explanation, bones: Bones, kinds: tuple[JointKind, ...], config: LossConfig
 ) -> dict[str, Float[Tensor, ""]]:
     """Stage 2 (Sec. 3.2, 3.3): the terms that need no label."""
-    own = part_maps(incident_maps(e.joints, kinds))
-    canonical = to_canonical(own, e.aligned, e.weights)  # S*
-    returned = deform(own, canonical, e.weights)
-    canonical_keypoints = apply(invert(own), e.keypoints[:, :, None])[:, :, 0]  # K*
-    canonical_weights = bones.weights(canonical, canonical_keypoints)  # w*
-    template_own = part_maps(incident_maps(e.template_joints, kinds))
-    template_returned = deform(
-        template_own,
-        to_canonical(template_own, e.template, e.template_weights),
-        e.template_weights,
-    )
-    to_template = cross_maps(e.joints, e.template_joints, kinds)
-    to_aligned = cross_maps(e.template_joints, e.joints, kinds)
-    x2y = deform(part_maps(to_template), e.aligned, e.weights)
-    y2x = deform(part_maps(to_aligned), e.template, e.template_weights)
-    nearest = losses.nearest_keypoint(e.aligned, e.keypoints)
+    d = deform_all(e, bones, kinds)
     terms: dict[str, Callable[[], Tensor]] = {
-        "cycle": lambda: losses.cycle(e.encoding.place(returned), e.encoding.place(e.aligned)),
-        "cycle_template": lambda: losses.cycle(template_returned, e.template),
-        "recon": lambda: losses.reconstruction(x2y, e.template, config.recon_form),
-        "recon_template": lambda: losses.reconstruction(e.aligned, y2x, config.recon_form),
-        "kp_seg": lambda: sum_of(
-            losses.keypoint_segmentation(keypoints, points, weights, config.support)
-            for keypoints, points, weights in (
-                (e.keypoints, e.aligned, e.weights),
-                (e.template_keypoints, e.template, e.template_weights),
-                (canonical_keypoints, canonical, canonical_weights),
-            )
-        ),
-        "seg": lambda: sum_of(
-            losses.segmentation(weights, nearest) for weights in (e.weights, canonical_weights)
-        ),
+        "cycle": lambda: losses.cycle(e.encoding.place(d.returned), e.encoding.place(e.aligned)),
+        "cycle_template": lambda: losses.cycle(d.template_returned, e.template),
+        "recon": lambda: losses.reconstruction(d.x2y, e.template, config.recon_form),
+        "recon_template": lambda: losses.reconstruction(e.aligned, d.y2x, config.recon_form),
         "shape_var": lambda: losses.shape_variance(
             e.residual, config.variance_scale, config.variance_form
         ),
-        "base_gap": lambda: (
-            base_gap(to_template, e.aligned, e.weights)
-            + base_gap(to_aligned, e.template, e.template_weights)
-        ),
+        "base_gap": lambda: d.gap,
         "state_gauge": lambda: losses.state_gauge(e.template_joints.state, e.template_joints.axis),
         "part_mass": lambda: losses.part_mass(e.weights) + losses.part_mass(e.template_weights),
-        **joint_terms(e, canonical, canonical_weights, kinds, config),
+        **keypoint_terms(e, d, config),
+        **joint_terms(e, d, kinds, config),
     }
     return weigh(terms, config)
 
 
+def keypoint_terms(
+    e: Explanation, d: Deformations, config: LossConfig
+) -> dict[str, Callable[[], Float[Tensor, ""]]]:
+    """The two regularisers of the segmentation (Sec. 3.3)."""
+    triples = (
+        (e.keypoints, e.aligned, e.weights),
+        (e.template_keypoints, e.template, e.template_weights),
+        (d.canonical_keypoints, d.canonical, d.canonical_weights),
+    )
+
+    def seg() -> Tensor:
+        nearest = losses.nearest_keypoint(e.aligned, e.keypoints)
+        return losses.segmentation(e.weights, nearest) + losses.segmentation(
+            d.canonical_weights, nearest
+        )
+
+    return {
+        "kp_seg": lambda: sum_of(
+            losses.keypoint_segmentation(*triple, config.support) for triple in triples
+        ),
+        "seg": seg,
+    }
+
+
 def joint_terms(
-    e: Explanation,
-    canonical: Float[Tensor, "B N 3"],
-    canonical_weights: Float[Tensor, "B N P"],
-    kinds: tuple[JointKind, ...],
-    config: LossConfig,
+    e: Explanation, d: Deformations, kinds: tuple[JointKind, ...], config: LossConfig
 ) -> dict[str, Callable[[], Float[Tensor, ""]]]:
     """The three regularisers of the joints (Sec. 3.3), on S* (or S_obj) and on Y_X."""
     x, y = e.joints, e.template_joints
@@ -235,7 +269,7 @@ def joint_terms(
             losses.joint_proximity(
                 pivot, points, config.proximity_scale, config.proximity_neighbours
             )
-            for pivot, points in ((x.pivot, canonical), (y.pivot, e.template))
+            for pivot, points in ((x.pivot, d.canonical), (y.pivot, e.template))
         ),
         "joint_boundary": lambda: sum_of(
             losses.joint_boundary(
@@ -249,7 +283,7 @@ def joint_terms(
     }
     if all(kind == "revolute" for kind in kinds):  # a slide has no line of boundary points
         terms["dir_align"] = lambda: (
-            losses.joint_direction(x.axis, canonical, canonical_weights)
+            losses.joint_direction(x.axis, d.canonical, d.canonical_weights)
             + losses.joint_direction(y.axis, e.template, e.template_weights)
         )
     return terms

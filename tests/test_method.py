@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from scapo.categories import CATEGORIES
-from scapo.method import AbstractMethod, ParameterGroup, Stage, Step
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
 from scapo.types import Labels, Observation, Prediction
 
-ABSTRACT = ["stages", "start", "losses", "predict"]
+ABSTRACT = ["variant", "stages", "start", "losses", "predict"]
 
 
 class Guess(AbstractMethod):
@@ -27,6 +27,10 @@ class Guess(AbstractMethod):
         self.category = CATEGORIES["oven"]
         self.supervision = frozenset({"segmentation"})
         self.score = nn.Parameter(torch.zeros(2))
+
+    @property
+    def variant(self) -> str:
+        return ""
 
     def stages(self) -> tuple[Stage, ...]:
         return (Stage(name="all", epochs=1, lr=0.1),)
@@ -42,7 +46,8 @@ class Guess(AbstractMethod):
         wanted = nn.functional.one_hot(labels.part, 2).double().mean((0, 1))
         return {"part": (self.score.softmax(0) - wanted).square().sum()}
 
-    def predict(self, observation: Observation) -> Prediction:
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
+        del mode
         shape = (*observation.points.shape[:-1], 2)
         return Prediction(part_weight=self.score.softmax(0).expand(shape))
 
