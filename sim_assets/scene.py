@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """SAPIEN as a renderer: one scene per object, one camera that is moved, depth and part read back.
 
-SAPIEN's own `trivial` shader is exact but writes three pictures; ours (`shaders/depth`) writes one
-with depth and entity, and takes about half the time. SAPIEN draws only front faces, so surfaces
-that are not closed are drawn twice, once reversed.
+SAPIEN's own `trivial` shader writes three pictures of four channels; ours (`shaders/depth`) writes
+one with depth and entity, in less than half the time. SAPIEN draws only
+front faces, so surfaces that are not closed are drawn twice, once reversed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject, Visual
@@ -118,8 +118,8 @@ class _Stage:
         for entity in self.parts:
             self.scene.add_entity(entity)
         ids = [entity.per_scene_id for entity in self.parts]
-        self.part_of_id = np.full(256, BACKGROUND, np.uint8)
-        self.part_of_id[ids] = np.arange(len(ids))
+        if ids != list(range(1, len(ids) + 1)):
+            raise RenderError(f"expected entities numbered 1, 2, ..., found {ids}")
         self.hidden: frozenset[int] = frozenset()
         self.reach = _reach(thing)
         self.size = (0, 0)
@@ -158,13 +158,13 @@ class _Stage:
     def shoot(self) -> Frame:
         self.scene.update_render()
         self.camera.take_picture()
-        position = self.camera.get_picture("Position")
         if not self.color:
-            part = self.part_of_id[position[..., 1].astype(np.uint8)]
-            return Frame(depth=np.ascontiguousarray(position[..., 0]), part=part)
-        entity = self.camera.get_picture("Segmentation")[..., 1]
-        part = self.part_of_id[entity.astype(np.uint8)]
-        depth = np.where(part == BACKGROUND, 0, -position[..., 2]).astype(np.float32)
+            surface = self.camera.get_picture("Surface")
+            depth = np.ascontiguousarray(surface.view(np.float32)[..., 0])
+            return Frame(depth=depth, part=_part(surface[..., 1].astype(np.uint8)))
+        part = _part(self.camera.get_picture("Segmentation")[..., 1].astype(np.uint8))
+        z = self.camera.get_picture("Position")[..., 2]
+        depth = np.where(part == BACKGROUND, 0, -z).astype(np.float32)
         color = np.clip(self.camera.get_picture("Color")[..., :3] * 255 + 0.5, 0, 255)
         return Frame(depth=depth, part=part, color=color.astype(np.uint8))
 
@@ -177,6 +177,11 @@ class _Stage:
         self.camera = RenderCameraComponent(*self.size, str(shader))
         self.eye.add_component(self.camera)
         self.scene.add_entity(self.eye)
+
+
+def _part(entity: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """Parts are entities 1, 2, ...; 0, where there is none, becomes 255."""
+    return entity - np.uint8(1)
 
 
 def _entity(visuals: tuple[Visual, ...], color: bool) -> sapien.Entity:

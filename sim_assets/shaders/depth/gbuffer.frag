@@ -1,7 +1,8 @@
 #version 450
 // SPDX-License-Identifier: MIT
-// One picture, `Position`: (depth in metres, entity, 0, 1). SAPIEN's `trivial` shader writes colour, position and
-// segmentation, three times the bytes. The last channel is alpha and the pictures are blended, so it must be 1.
+// One picture, `Surface`: (bits of the depth in metres as float32, number of the entity, 0, 0); 0 where nothing is.
+// SAPIEN's `trivial` shader writes three pictures. This one is of integers because pictures of floats are blended with
+// what was drawn before, which takes longer and costs the last digits.
 
 layout(set = 2, binding = 0) uniform MaterialBuffer {
   vec4 emission;
@@ -50,8 +51,8 @@ layout(set = 3, binding = 0) uniform SceneBuffer {
 layout(location = 0) in float inDepth;
 layout(location = 1) in flat uint inEntity;
 
-layout(location = 0) out vec4 outPosition;
+layout(location = 0) out uvec4 outSurface;
 
 void main() {
-  outPosition = vec4(inDepth, float(inEntity), 0, 1);
+  outSurface = uvec4(floatBitsToUint(inDepth), inEntity, 0, 0);
 }
