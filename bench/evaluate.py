@@ -140,11 +140,15 @@ def _report(
             "data": split.manifest.digest,
             "predictions": sha256_file(request.predictions),
         },
-        "versions": {
-            "scapo": version("scapo"),
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": _versions(),
         "instance": instance.tolist(),
         **summarise(errors, instance, request.settings.ap_rule),
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "scapo": version("scapo"),
+        "numpy": np.__version__,
+        "python": platform.python_version(),
     }

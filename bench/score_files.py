@@ -127,36 +127,7 @@ def read_scores(path: Path) -> list[Scores]:
     Raises:
         StoreError: Not gzip, not our columns, a value that is no number, slots with gaps.
     """
-    import pandas as pd
-
-    try:
-        frame = pd.read_csv(
-            path,
-            compression="gzip",
-            keep_default_na=False,
-            na_values={"value": [""]},
-            dtype={
-                "method": str,
-                "variant": str,
-                "data": str,
-                "category": str,
-                "split": str,
-                "metric": str,
-                "unit": str,
-                "value": float,
-                "seed": np.int64,
-                "sample": np.int64,
-                "slot": np.int64,
-            },
-        )
-    except (OSError, EOFError, ValueError, pd.errors.ParserError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise StoreError(f"{path}: expected gzipped CSV of scores, found {first}") from error
-    if tuple(frame.columns) != COLUMNS:
-        raise StoreError(
-            f"{path}: expected columns {','.join(COLUMNS)}, found "
-            f"{','.join(map(str, frame.columns))}"
-        )
+    frame = _read_frame(path)
     report = _read_report(side_file(path))
     out = []
     for key, rows in frame.groupby(list(COLUMNS[:6]), sort=True):
@@ -180,6 +151,33 @@ def read_scores(path: Path) -> list[Scores]:
             )
         )
     return out
+
+
+def _read_frame(path: Path) -> Any:  # noqa: ANN401
+    import pandas as pd
+
+    types = {
+        **dict.fromkeys(("method", "variant", "data", "category", "split", "metric", "unit"), str),
+        **dict.fromkeys(("seed", "sample", "slot"), np.int64),
+        "value": float,
+    }
+    try:
+        frame = pd.read_csv(
+            path,
+            compression="gzip",
+            keep_default_na=False,
+            na_values={"value": [""]},
+            dtype=cast("Any", types),
+        )
+    except (OSError, EOFError, ValueError, pd.errors.ParserError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise StoreError(f"{path}: expected gzipped CSV of scores, found {first}") from error
+    if tuple(frame.columns) != COLUMNS:
+        raise StoreError(
+            f"{path}: expected columns {','.join(COLUMNS)}, found "
+            f"{','.join(map(str, frame.columns))}"
+        )
+    return frame
 
 
 def _arrays(path: Path, rows: Any, samples: Int[np.ndarray, " B"]) -> Errors:  # noqa: ANN401

@@ -3,12 +3,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 
+import made
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from bench import compat
 from bench.compat_chain import dir_to_dir_rotation, exp_so3
+from bench.compat_eap import eap_iou
 from bench.matching import project_rotations
 from bench.metrics import sample_errors
 
@@ -114,7 +116,7 @@ def perfect_record(seed, parts, kind):
     """Network outputs whose truth follows from proper rigid geometry, part by part (scipy)."""
     generator = np.random.default_rng(seed)
     count, joints = 48, parts - 1
-    turn = Rotation.random(count, random_state=seed).as_matrix()
+    turn = made.rotations(generator, count)
     record = {
         "R_select": turn,
         "T_select": generator.normal(scale=0.1, size=(count, 3)),
@@ -128,7 +130,7 @@ def perfect_record(seed, parts, kind):
         record[f"{name}_drct"] = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
         record[f"{name}_joint"] = generator.normal(scale=0.2, size=(count, joints, 3))
         record[f"{name}_angl"] = generator.uniform(-0.6, 0.6, size=(count, joints, 2))
-    canon = Rotation.random(parts, random_state=seed + 1).as_matrix()
+    canon = made.rotations(generator, parts)
     shift = generator.normal(scale=0.1, size=(parts, 3))
     pose = np.tile(np.eye(4), (count, parts, 1, 1))
     for part in range(parts):
@@ -180,6 +182,19 @@ def test_the_released_code_evaluates_the_base_as_third_part():
     assert released["rot_err_deg"][:, 2].mean() > 5
 
 
+def test_many_slots_are_matched_too():
+    """Past seven slots the orders are no longer listed one by one."""
+    generator = np.random.default_rng(0)
+    true = np.zeros((2, 9, 50))
+    true[:, :3] = np.moveaxis(np.eye(3)[generator.integers(0, 3, size=(2, 50))], -1, 1)
+    places = generator.permutation(9)
+    found = eap_iou(true[:, places], true)
+    np.testing.assert_array_equal(found["mean_iou"], 1)
+    np.testing.assert_array_equal(places[found["match_pred"][:, :3]], [[0, 1, 2]] * 2)
+    few = eap_iou(true[:, :3], true[:, :3] * 0)
+    assert np.isnan(few["mean_iou"]).all()
+
+
 def test_a_record_must_be_whole():
     record = perfect_record(3, 2, "r")
     del record["S_angl"]
@@ -189,7 +204,7 @@ def test_a_record_must_be_whole():
 
 def test_eap_calibration_finds_the_frame_of_most():
     generator = np.random.default_rng(0)
-    turn = Rotation.random(random_state=1)
+    turn = Rotation.from_matrix(made.rotations(generator, 1)[0])
     noise = Rotation.from_rotvec(generator.normal(scale=0.05, size=(40, 3)))
     shifts = np.array([0.1, 0.2, 0.3]) + generator.normal(scale=0.005, size=(40, 3))
     shifts[:10] += 1

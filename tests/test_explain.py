@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from bench import __main__ as program
 from bench.evaluate import Request, evaluate
 from bench.explain import LADDER_COLUMNS, STRATA_COLUMNS, measure
+from bench.explain_plots import plot_ladder, plot_strata
 from bench.ladder import RUNGS
 from bench.predictions import write_predictions
 from bench.reference import write_reference
@@ -227,6 +228,16 @@ def test_the_mean_joint_is_the_joint_where_all_agree(tmp_path):
                               settings=Settings(label_order="dataset")))  # fmt: skip
     assert report["summary"]["joint_direction_deg"]["mean"] == pytest.approx(0, abs=0.01)
     assert report["summary"]["joint_pivot_r4"]["mean"] == pytest.approx(0, abs=0.03)
+
+
+def test_plots_of_what_cannot_be_computed(split, tmp_path):
+    path = tmp_path / "p.safetensors"
+    labels = {"part": made.truth_as_prediction(split)["part"]}
+    write_predictions(path, made.header_of(split), labels)
+    found = measure(Request(predictions=path, data=root(split), out=tmp_path))
+    few = [stratum for stratum in found.strata if stratum.factor == "state"]
+    for data in (plot_ladder(found.ladder, "labels alone"), plot_strata(few, "labels alone")):
+        assert data.startswith(b"\x89PNG")
 
 
 def test_the_files(tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import made
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,13 +9,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bench.matching import apply_calibration, calibrate, fit_calibration
-from bench.ordering import part_orders
 
 
 def poses(generator, *shape, spread=1.0):
     out = np.tile(np.eye(4), (*shape, 1, 1))
-    turns = Rotation.random(int(np.prod(shape)), random_state=int(generator.integers(2**31)))
-    out[..., :3, :3] = turns.as_matrix().reshape(*shape, 3, 3)
+    turns = made.rotations(generator, int(np.prod(shape)))
+    out[..., :3, :3] = turns.reshape(*shape, 3, 3)
     out[..., :3, 3] = generator.normal(scale=spread, size=(*shape, 3))
     return out
 
@@ -81,10 +81,3 @@ def test_a_part_without_an_answer_has_no_offset():
 def test_two_samples_are_enough():
     _, true, pred, offsets, scale = own_frames(9, count=2)
     np.testing.assert_allclose(fit_calibration(pred, true, scale=scale), offsets, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("parts", "orders"), [(1, [[0]]), (2, [[0, 1], [1, 0]]), (3, [[0, 1, 2], [0, 2, 1]])]
-)
-def test_orders_by_rule(parts, orders):
-    np.testing.assert_array_equal(part_orders(parts), orders)

@@ -10,52 +10,21 @@ import subprocess
 
 import numpy as np
 import pytest
+from scored import OBJECTS, SAMPLES, make_scores
 
 from bench import __main__ as program
 from bench import tables
 from bench.latex import escape, to_latex
-from bench.paper import check, mean_mismatches, printed_cells
-from bench.results import Results, load
-from bench.score_files import Run, read_scores, side_file, write_report, write_rows, writing
+from bench.paper import check, printed_cells
+from bench.precision_table import table_2
+from bench.results import Results, Series, load
+from bench.significance import COLUMNS, significance_csv
 from bench.statistics import interval
 from bench.table_data import PRECISION_KEYS, TABLE_1_CATEGORIES, TABLE_2_CATEGORIES
 from bench.table_model import DASH
+from bench.table_notes import general_notes
+from bench.table_rows import display_name
 from bench.table_text import to_csv, to_markdown
-from scapo.store import StoreError
-
-SAMPLES, OBJECTS = 40, 8
-
-
-def make_scores(
-    folder, method, category, *, seed=1, kind="clean", quality=1.0, supervision=(), variant="",
-    samples=SAMPLES, digest="0123456789ab",
-):  # fmt: skip
-    """A scores file with random errors; larger `quality` is worse."""
-    generator = np.random.default_rng([seed, len(category), len(method)])
-    parts = 3 if category in ("eyeglasses", "basket") else 2
-    metres = quality * generator.gamma(2, 0.03, size=(samples, parts))
-    errors = {
-        ("iou", "1"): generator.uniform(0.5, 1, size=(samples, parts)),
-        ("joint_direction", "deg"): quality * generator.gamma(2, 3, size=(samples, parts - 1)),
-        ("joint_pivot", "r4"): metres[:, 1:] * 3,
-        ("joint_pivot", "m"): metres[:, 1:],
-        ("joint_state", "deg"): generator.gamma(2, 3, size=(samples, parts - 1)),
-        ("part_rotation", "deg"): quality * generator.gamma(2, 4, size=(samples, parts)),
-        ("part_translation", "r4"): metres * 3,
-        ("part_translation", "m"): metres,
-    }
-    errors["iou", "1"][0] = np.nan
-    run = Run(method=method, variant=variant, seed=seed, data=f"{kind}@{digest}",
-              category=category, split="test")  # fmt: skip
-    path = folder / f"{kind}-{category}-{method}-{variant}-{seed}.csv.gz"
-    with writing(path) as stream:
-        write_rows(stream, run, 0, {key: value[:15] for key, value in errors.items()})
-        write_rows(stream, run, 15, {key: value[15:] for key, value in errors.items()})
-    write_report(side_file(path), {
-        "supervision": list(supervision), "instance": (np.arange(samples) % OBJECTS).tolist(),
-        "budget": {"device": "cpu", "seconds": 12.5},
-    })  # fmt: skip
-    return errors
 
 
 @pytest.fixture(scope="module")
@@ -180,23 +149,6 @@ def test_the_papers_tables_from_the_same_code():
     assert [row["value"] for row in ablation] == ["82.77", "4.73", "0.137"]
 
 
-def test_arithmetic_mismatches():
-    found = {(m.table, m.metric, m.method, f"{m.recomputed:.2f}")
-             for m in mean_mismatches(printed_cells())}  # fmt: skip
-    assert len([item for item in found if item[0] == "1"]) == 11
-    assert len([item for item in found if item[0] == "2"]) == 9
-    assert {
-        ("1", "seg_iou", "Ours", "84.58"),
-        ("1", "joint_dir", "OP-Align", "4.19"),
-        ("2", "part_15", "OP-Align(SJ)", "68.82"),
-        ("2", "part_5", "3DGCN", "14.51"),
-    } <= found
-    lines = check()
-    assert "Table 2 Ours laptop: joint_10 99.27 but joint_15 98.30" in lines
-    assert any("joint_15: Ours minus OP-Align(SJ) +3.18 as printed, +0.92" in line
-               for line in lines)  # fmt: skip
-
-
 def test_precision_is_k_of_n_and_monotone(scores):
     folder, kept = scores
     for rule in ("mean", "min", "per-part"):
@@ -272,57 +224,34 @@ def test_latex_compiles_and_golden(scores, tmp_path, repository, update_golden):
         assert (tmp_path / f"table{number}.pdf").stat().st_size > 1000
 
 
+def test_names_of_rows():
+    assert display_name(Series("scapo", "", "")) == "SCAPO"
+    assert display_name(Series("scapo", "cpu", "label-order=dataset")) == (
+        "SCAPO (cpu), one part order"
+    )
+    assert display_name(Series("mine", "default", "iou=soft")) == "mine, iou=soft"
+
+
+def test_notes_are_under_every_table():
+    for table in tables.build(Results([])):
+        assert set(general_notes()) <= set(table.notes)
+        assert all(note in to_markdown(table) for note in general_notes())
+
+
+def test_one_method_alone_has_no_comparison(tmp_path):
+    make_scores(tmp_path, "scapo", "drawer", kind="sensor")
+    results = load(tmp_path)
+    assert significance_csv(results).splitlines() == [",".join(COLUMNS)]
+    cells = table_2(results, printed_cells(), [], "mean")
+    row = one(cells, block="Drawer", method="SCAPO", source="ours", column="State")
+    assert row["value"] != ""
+
+
 def test_names_cannot_break_latex():
     assert escape(r"50% of_$x & {y}~#\^") == (
         r"50\% of\_\$x \& \{y\}\textasciitilde{}\#\textbackslash{}\textasciicircum{}"
     )
     assert escape("é") == "?"
-
-
-def test_two_data_sets_are_not_mixed(scores, tmp_path):
-    make_scores(tmp_path, "scapo", "laptop")
-    make_scores(tmp_path, "icp", "laptop", digest="ffffffffffff")
-    with pytest.raises(StoreError, match=r"expected scores on clean@.* like .*, found clean@"):
-        load(tmp_path)
-
-
-def test_a_run_is_not_counted_twice(tmp_path):
-    make_scores(tmp_path / "a", "scapo", "laptop")
-    make_scores(tmp_path / "b", "scapo", "laptop")
-    with pytest.raises(StoreError, match="expected one scores file per run, found seed 1 also"):
-        load(tmp_path)
-
-
-def test_seeds_must_share_their_samples(tmp_path):
-    make_scores(tmp_path, "scapo", "laptop", seed=1)
-    make_scores(tmp_path, "scapo", "laptop", seed=2, samples=SAMPLES - 1)
-    with pytest.raises(StoreError, match="expected the 40 samples of"):
-        tables.build(load(tmp_path))
-
-
-@pytest.mark.parametrize("damage", ["no gzip", "columns", "metric", "doubled", "text", "json"])
-def test_damaged_scores_are_refused(damage, tmp_path):
-    make_scores(tmp_path, "scapo", "laptop")
-    (path,) = tmp_path.glob("*.csv.gz")
-    import gzip
-
-    text = gzip.decompress(path.read_bytes()).decode()
-    lines = text.splitlines(keepends=True)
-    changed = {
-        "columns": text.replace("metric,slot", "slot,metric", 1),
-        "metric": text.replace(",iou,", ",area,"),
-        "doubled": text + lines[-1],
-        "text": text.replace(lines[5], lines[5].rsplit(",", 2)[0] + ",much,deg\n"),
-    }
-    if damage in changed:
-        path.write_bytes(gzip.compress(changed[damage].encode()))
-    elif damage == "json":
-        side_file(path).write_text("{")
-    else:
-        path.write_bytes(text.encode())
-    with pytest.raises(StoreError, match="expected") as caught:
-        read_scores(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_without_the_json_the_numbers_are_the_same(scores, tmp_path):
@@ -350,9 +279,3 @@ def test_the_commands(scores, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         program.main(["tables", "--scores", str(tmp_path / "none")])
     assert ended.value.code == 1
-
-
-def test_the_printed_numbers_are_those_of_the_paper(shared_dir, repository):
-    theirs = (shared_dir / "paper" / "paper_tables.csv").read_text()
-    assert (repository / "bench" / "paper.csv").read_text() == theirs.replace("\r\n", "\n")
-    assert (repository / "results" / "paper.csv").read_text() == theirs.replace("\r\n", "\n")
