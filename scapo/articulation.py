@@ -50,8 +50,8 @@ class JointConfig:
     """Hold the parent's state at 0: moving the base is the same as moving the object."""
 
 
-def thin(points: Float[Tensor, "B N 3"], count: int) -> Float[Tensor, "B {count} 3"]:
-    """`count` of the points, evenly taken from their order."""
+def thin(points: Float[Tensor, "B N 3"], count: int) -> Float[Tensor, "B K 3"]:
+    """`count` of the points, evenly taken from their order; all where there are fewer."""
     if count >= points.shape[1]:
         return points
     return points[:, torch.arange(count, device=points.device) * points.shape[1] // count]

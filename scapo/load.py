@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: MIT
+"""`scapo.load`: a trained model from its run folder, checkpoint file or category, ready to use."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from scapo.categories import CATEGORIES, category
+from scapo.checkpoint import config_from, load_arrays, read_checkpoint
+from scapo.layout import StoreError
+from scapo.method import Mode
+from scapo.model import Scapo, ScapoConfig
+from scapo.types import Joints, Observation, Prediction
+
+RELEASED = "weights"
+"""Folder in the package with one checkpoint per released category."""
+
+
+class Predictor:
+    """A trained SCAPO model for clouds of one category."""
+
+    def __init__(self, model: Scapo, device: str) -> None:
+        """Hold the model in eval mode on the device."""
+        self.model = model.to(device).eval()
+        self.device = device
+
+    def predict(
+        self, points: Float[np.ndarray, "*B N 3"] | Float[Tensor, "*B N 3"], mode: Mode = "fast"
+    ) -> Prediction:
+        """Parts, poses and joints of one cloud or of several.
+
+        Args:
+            points: Camera frame, metres, numpy or torch.
+            mode: `fast`, networks only, or `refine`.
+
+        Returns:
+            Tensors on the CPU with the same leading dimensions; `np.asarray` takes them as they
+            are.
+
+        Raises:
+            ValueError: Another shape, fewer points than the encoder's neighbours, values that
+                are not finite.
+        """
+        cloud = torch.as_tensor(points, dtype=torch.float32, device=self.device)
+        least = self.model.config.encoder.neighbours
+        if cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < least:
+            raise ValueError(
+                f"points: expected shape (..., N, 3) with N at least {least}, "
+                f"found {tuple(cloud.shape)}"
+            )
+        shape = cloud.shape[:-2]
+        flat = cloud.reshape(-1, *cloud.shape[-2:])
+        return _reshaped(self.model.predict(Observation(points=flat), mode), shape)
+
+
+def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
+    """A trained model.
+
+    Args:
+        path_or_category: A run folder, a checkpoint file, or the name of a category whose
+            weights come with the package.
+        device: Where it runs.
+
+    Raises:
+        StoreError: There is no checkpoint of SCAPO.
+    """
+    path = find(path_or_category)
+    arrays, header = read_checkpoint(path)
+    if header.get("method") != Scapo.name:
+        raise StoreError(f"{path}: expected method {Scapo.name!r}, found {header.get('method')!r}")
+    config = config_from(ScapoConfig, header["config"], f"{path}: config")
+    model = Scapo(config, category(header["category"]), torch.Generator())
+    load_arrays(model, arrays, path)
+    return Predictor(model, device)
+
+
+def find(path_or_category: str | Path) -> Path:
+    """The checkpoint's path.
+
+    Raises:
+        StoreError: Nothing of that name.
+    """
+    path = Path(path_or_category)
+    if path.exists():
+        return path
+    released = Path(str(files("scapo"))) / RELEASED
+    if str(path_or_category) in CATEGORIES:
+        path = released / f"{path_or_category}.safetensors"
+        if path.is_file():
+            return path
+    known = ", ".join(sorted(item.stem for item in released.glob("*.safetensors"))) or "none yet"
+    raise StoreError(
+        f"{path_or_category}: expected a run folder, a checkpoint or a category with released "
+        f"weights ({known}), found none"
+    )
+
+
+def _reshaped(prediction: Prediction, shape: torch.Size) -> Prediction:
+    def back(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else tensor.reshape(*shape, *tensor.shape[1:]).cpu()
+
+    joints = prediction.joints
+    if joints is not None:
+        joints = Joints(
+            pivot=joints.pivot.reshape(*shape, *joints.pivot.shape[1:]).cpu(),
+            axis=joints.axis.reshape(*shape, *joints.axis.shape[1:]).cpu(),
+            state=joints.state.reshape(*shape, *joints.state.shape[1:]).cpu(),
+        )
+    weight = prediction.part_weight
+    return Prediction(
+        part_weight=weight.reshape(*shape, *weight.shape[1:]).cpu(),
+        camera_T_part=back(prediction.camera_T_part),
+        joints=joints,
+        canonical_points=back(prediction.canonical_points),
+        confidence=back(prediction.confidence),
+    )
