@@ -18,7 +18,7 @@ from scapo.camera import Intrinsics
 from scapo.points import farthest_points
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.options import Sampling
-from sim_assets.renderer import BACKGROUND, Frame, face_colors
+from sim_assets.renderer import Frame, face_colors
 from sim_assets.views import generator
 
 SURFACE_SAMPLES = 512
@@ -69,8 +69,8 @@ def truth(
 
 
 def visible_pixels(frames: list[Frame]) -> list[Int[np.ndarray, " _"]]:
-    """Flat indices of the pixels that show the object, per picture."""
-    return [np.flatnonzero(frame.part != BACKGROUND) for frame in frames]
+    """Flat indices of the pixels that show the object, or what is taken for it, per picture."""
+    return [np.flatnonzero(frame.depth > 0) for frame in frames]
 
 
 def sample_frames(
@@ -126,7 +126,7 @@ def choose_far(
 
 
 def _pick(
-    images: list[np.ndarray], source: Int[np.ndarray, " N"], pixel: Int[np.ndarray, " N"]
+    images: list[np.ndarray], source: Int[np.ndarray, " ..."], pixel: Int[np.ndarray, " ..."]
 ) -> np.ndarray:
     if len(images) == 1:
         return images[0][pixel]
@@ -193,13 +193,12 @@ class Surface:
         ray_y = (v + 0.5 - camera.cy) / camera.fy
         along = ray_x * nx + ray_y * ny + nz
         plane = (x * nx + y * ny + z * nz) / np.where(along == 0, 1e-12, along)
-        shares = []
-        for part in range(len(self.points)):
-            frame = frames[part] if len(frames) > 1 else frames[0]
-            label, depth = frame.part.ravel()[pixel[part]], frame.depth.ravel()[pixel[part]]
-            near = np.abs(plane[part] - depth) <= self.tolerance
-            shares.append((inside[part] & (label == part) & near).mean())
-        return np.array(shares)
+        image = np.arange(len(pixel))[:, None] % len(frames)  # one for all, or one per part
+        label = _pick([frame.part.ravel() for frame in frames], image, pixel)
+        depth = _pick([frame.depth.ravel() for frame in frames], image, pixel)
+        seen = inside & (label == np.arange(len(pixel))[:, None])
+        seen &= np.abs(plane - depth) <= self.tolerance
+        return seen.mean(-1)
 
     def sample(
         self,

@@ -30,8 +30,8 @@ FILL_MARGIN = 0.005
 """Kept from both ends of FILL, so that whole pixels stay inside it too."""
 JITTER = 0.05
 """Largest offset of the box's centre from the image's centre, as a share of the image's side."""
-STEPS = 7
-"""Of the fixed-point iteration that frames the object; 4e-4 of the image is left at most."""
+STEPS = 6
+"""Of the fixed-point iteration that frames the object; 1e-3 of the image is left at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
