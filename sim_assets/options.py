@@ -8,6 +8,9 @@ from typing import Literal
 
 Protocol = Literal["joint", "isolated", "full"]
 Sampling = Literal["random", "fps"]
+Noise = Literal["none", "kinect", "disparity"]
+Mask = Literal["exact", "imperfect"]
+Preset = Literal["sim-art", "sim-art-sensor", "op-align", "eap"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,17 +36,27 @@ class DataOptions:
     """Of objects, joint states, cameras and points."""
     points: int = 1024
     """Points of a cloud; drawn with replacement where fewer pixels are visible."""
-    protocol: Protocol = "joint"
+    protocol: Protocol | None = None
     """joint: the depth image of the whole object. isolated: each part rendered alone, and merged
-    (EAP, OP-Align). full: the whole surface."""
-    noise: Literal["none"] = "none"
-    """Of the depth sensor."""
+    (EAP, OP-Align). full: the whole surface. Default: the preset's, joint for sim-art."""
+    preset: Preset = "sim-art"
+    """States, views and camera. sim-art: each category's travel and window, the object filling 50
+    to 90 % of the image. sim-art-sensor: the same windows, 640 x 480, a drawn distance. op-align,
+    eap: the published windows (isolated parts, farthest-point sampling, 640 x 480)."""
+    noise: Noise = "none"
+    """Of the depth sensor. kinect: structured light (Nguyen et al. 2012). disparity: disturbed and
+    rounded disparities (Handa et al. 2014). Both with flying pixels and holes."""
+    mask: Mask = "exact"
+    """Which pixels are taken for the object. imperfect: an outline with errors, missing pieces,
+    and foreign points (part 255)."""
     backend: Literal["auto", "sapien", "raycast"] = "auto"
     """Renderer; auto: SAPIEN where a Vulkan device is found, else ray casting."""
-    image_size: int = 256
-    """Width and height in pixels; the field of view is 60 degrees."""
-    sampling: Sampling = "random"
-    """Of points among the visible pixels: uniform, or farthest-point sampling (slow)."""
+    image_size: int | None = None
+    """Width and height in pixels; default: the preset's, 256 for sim-art, whose field of view is 60
+    degrees."""
+    sampling: Sampling | None = None
+    """Of points among the visible pixels: random (uniform), or fps (farthest points, slow).
+    Default: the preset's, random for sim-art."""
     color: bool = False
     """Store the colour of each point."""
     states_per_view: int = 1

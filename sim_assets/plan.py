@@ -44,10 +44,13 @@ class Request:
         """All that changes pixels, for the manifest."""
         settings = asdict(self.settings)
         camera = settings.pop("camera")
+        settings.pop("held_out")  # said by the split
+        for name, usual in (("preset", "sim-art"), ("mask", "exact")):
+            if settings[name] == usual:
+                settings.pop(name)
         return {
             **settings,
             "camera": camera,
-            "noise": "none",
             "source": self.source,
             "instances": self.instances,
             **self.source_options,

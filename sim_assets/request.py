@@ -5,18 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import metadata
-from math import ceil, radians
+from math import ceil
 from pathlib import Path
 
-from scapo.camera import Intrinsics
 from scapo.categories import category as find_category
 from sim_assets.assets import Asset, folder_assets, procedural_assets
 from sim_assets.options import DataOptions, Protocol
 from sim_assets.plan import Request
+from sim_assets.presets import camera, rules
 from sim_assets.renderer import Backend, resolve_backend
 from sim_assets.samples import Settings
 
-FIELD_OF_VIEW = radians(60)
 SAMPLES_PER_INSTANCE = 50
 """By default, as the benchmark's training split (CONTRACT 4)."""
 MIN_IMAGE, MAX_IMAGE = 32, 4096
@@ -67,16 +66,26 @@ def versions(backend: Backend, protocol: Protocol) -> dict[str, str]:
 
 
 def _settings(options: DataOptions) -> Settings:
-    size = options.image_size
-    needed = options.protocol != "full"
+    preset = rules(options.preset)
+    protocol = options.protocol or preset.protocol
+    needed = protocol != "full"
+    if not needed and (options.noise, options.mask) != ("none", "exact"):
+        raise ValueError(
+            f"noise and mask: expected none and exact with protocol full, which has no picture, "
+            f"found {options.noise} and {options.mask}"
+        )
     return Settings(
-        protocol=options.protocol,
+        protocol=protocol,
         backend=resolve_backend(options.backend) if needed else "raycast",
-        camera=Intrinsics.from_fov(FIELD_OF_VIEW, size, size),
+        camera=camera(options.preset, options.image_size),
         points=options.points,
-        sampling=options.sampling,
+        sampling=options.sampling or preset.sampling,
         color=options.color,
         states_per_view=options.states_per_view,
+        preset=options.preset,
+        held_out=options.split in ("test", "test-ood"),
+        noise=options.noise,
+        mask=options.mask,
     )
 
 
@@ -116,7 +125,7 @@ def _check(options: DataOptions) -> None:
     for name, value, minimum in least:
         if value is not None and value < minimum:
             raise ValueError(f"{name}: expected {minimum} or more, found {value}")
-    if options.image_size > MAX_IMAGE:
+    if options.image_size is not None and options.image_size > MAX_IMAGE:
         raise ValueError(f"image_size: expected {MAX_IMAGE} or less, found {options.image_size}")
     if options.instances is not None and options.instances > options.count:
         raise ValueError(

@@ -12,9 +12,12 @@ import numpy as np
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.cloud import Cloud, Surface, sample_frames, truth, visible_pixels
-from sim_assets.options import Protocol, Sampling
+from sim_assets.noise import Sensor, measure
+from sim_assets.options import Mask, Noise, Preset, Protocol, Sampling
+from sim_assets.preset_views import draw_preset_views
+from sim_assets.presets import least_points
 from sim_assets.renderer import AbstractRenderer, Backend, Frame
-from sim_assets.views import Outline, View, draw_views, generator
+from sim_assets.views import Outline, View, generator
 
 Row = dict[str, np.ndarray]
 """One sample: the tensors of CONTRACT 3 without their first dimension."""
@@ -46,6 +49,12 @@ class Settings:
     sampling: Sampling
     color: bool
     states_per_view: int
+    preset: Preset = "sim-art"
+    """Of states and views."""
+    held_out: bool = False
+    """A test split: eyeglasses then have a published grid of their own."""
+    noise: Noise = "none"
+    mask: Mask = "exact"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,7 +79,10 @@ class Shooter:
         self.renderer, self.thing, self.settings = renderer, thing, settings
         self.outline = Outline(thing)
         self.surface = Surface(thing)
-        self.least = min(LEAST_POINTS, max(1, settings.points // (4 * len(thing.visuals))))
+        parts = len(thing.visuals)
+        self.least = min(LEAST_POINTS, max(1, settings.points // (4 * parts)))
+        self.asked = least_points(settings.preset, settings.protocol, parts, settings.points)
+        self.sensor = Sensor(noise=settings.noise, mask=settings.mask)
         if settings.protocol != "full":
             renderer.open(thing)
 
@@ -84,7 +96,7 @@ class Shooter:
         for start in range(0, len(keys), BATCH):
             batch = keys[start : start + BATCH]
             rngs = [generator(*key, 0) for key in batch]
-            views = draw_views(self.outline, rngs, settings.camera, settings.states_per_view)
+            views = draw_preset_views(self.outline, rngs, settings)
             for key, rng, view in zip(batch, rngs, views, strict=True):
                 yield self._shoot(key, rng, view)
 
@@ -93,8 +105,7 @@ class Shooter:
         for draws in range(1, MAX_DRAWS + 1):
             if draws > 1:
                 rng = generator(*key, draws - 1)
-                camera, states = self.settings.camera, self.settings.states_per_view
-                (view,) = draw_views(self.outline, [rng], camera, states)
+                (view,) = draw_preset_views(self.outline, [rng], self.settings)
             rows = self._rows(view, rng)
             if rows is not None:
                 return Shot(rows=rows, draws=draws, plan=plan)
@@ -124,15 +135,15 @@ class Shooter:
             )
         else:
             frames = self._frames(state, view)
-            seen = visible_pixels(frames)
+            sensed = [measure(frame, settings.camera, rng, self.sensor) for frame in frames]
+            seen = visible_pixels(sensed)
             if sum(len(pixels) for pixels in seen) < LEAST_PIXELS:
                 return None
             cloud = sample_frames(
-                frames, seen, settings.camera, settings.points, rng, settings.sampling
+                sensed, seen, settings.camera, settings.points, rng, settings.sampling
             )
             visible = self.surface.visible(frames, settings.camera, known.camera_T_part)
-        per_part = np.bincount(cloud.part, minlength=len(known.camera_T_part))
-        if per_part.min() < self.least:
+        if not self._enough(cloud):
             return None
         return {
             **_cloud_row(cloud, settings.color),
@@ -143,6 +154,12 @@ class Shooter:
             "visible": visible.astype(np.float32),
             "camera": np.array(settings.camera.row(), np.float32),
         }
+
+    def _enough(self, cloud: Cloud) -> bool:
+        """Whether each part has the points it needs."""
+        parts = len(self.thing.visuals)
+        per_part = np.bincount(cloud.part, minlength=parts)[:parts]
+        return bool((per_part >= np.maximum(self.least, self.asked)).all())
 
     def _frames(self, state: np.ndarray, view: View) -> list[Frame]:
         camera = self.settings.camera

@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""A rendered picture as a depth sensor and a segmentation would give it.
+
+Depth models: `noise_kinect`, `noise_disparity`. Around them what every sensor does: a scene behind
+and beside the object (`noise_scene`), flying pixels and holes (`noise_edges`), a mask with errors
+(`noise_mask`). Poses and joints stay exact, and the part of a pixel is that whose surface the
+sensor measured there, 255 where it is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from scapo.camera import Intrinsics
+from sim_assets.noise_disparity import PUBLISHED as DISPARITY
+from sim_assets.noise_disparity import Disparity, disparity
+from sim_assets.noise_edges import CHOSEN as EDGES
+from sim_assets.noise_edges import Edges, flying_pixels, holes
+from sim_assets.noise_kinect import PUBLISHED as KINECT
+from sim_assets.noise_kinect import Kinect, kinect
+from sim_assets.noise_mask import CHOSEN as MASK
+from sim_assets.noise_mask import MaskErrors, wrong_mask
+from sim_assets.noise_scene import BESIDE, Clutter, put_behind, put_beside
+from sim_assets.noise_surface import surface
+from sim_assets.options import Mask, Noise
+from sim_assets.renderer import BACKGROUND, Frame
+
+Depth = Float[np.ndarray, "H W"]
+Parts = UInt8[np.ndarray, "H W"]
+MARGIN = {"exact": 0.0, "imperfect": 0.15}
+"""Around the object's image, as a share of its longer side: what the sensor is simulated for."""
+LEAST_MARGIN = 8
+"""Pixels more."""
+FOREIGN_COLOR = 128
+"""Grey level of what is not the object."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sensor:
+    """What is simulated."""
+
+    noise: Noise
+    mask: Mask
+    kinect: Kinect = KINECT
+    disparity: Disparity = DISPARITY
+    edges: Edges = EDGES
+    clutter: Clutter = BESIDE
+    errors: MaskErrors = MASK
+
+
+def measure(frame: Frame, camera: Intrinsics, rng: np.random.Generator, sensor: Sensor) -> Frame:
+    """The picture as the sensor and its mask give it.
+
+    Args:
+        frame: As rendered.
+        camera: Intrinsics.
+        rng: Of this picture.
+        sensor: What is simulated.
+
+    Returns:
+        Depth 0 outside the mask and where nothing was measured; part 255 there and where
+        something else than the object was measured.
+    """
+    depth, part = corrupt(frame.depth, frame.part, camera, rng, sensor)
+    color = frame.color
+    if color is not None:
+        foreign = (part == BACKGROUND) & (depth > 0)
+        color = np.where(foreign[..., None], np.uint8(FOREIGN_COLOR), color)
+    return replace(frame, depth=depth, part=part, color=color)
+
+
+def corrupt(
+    depth: Depth, part: Parts, camera: Intrinsics, rng: np.random.Generator, sensor: Sensor
+) -> tuple[Depth, Parts]:
+    """See `measure`; pictures that do not show the object stay as they are."""
+    if sensor.noise == "none" and sensor.mask == "exact":
+        return depth, part
+    window = _window(part != BACKGROUND, MARGIN[sensor.mask])
+    if window is None:
+        return depth, part
+    rows, columns = window
+    cropped = replace(
+        camera,
+        cx=camera.cx - columns.start,
+        cy=camera.cy - rows.start,
+        width=columns.stop - columns.start,
+        height=rows.stop - rows.start,
+    )
+    made_depth, made_part = np.zeros_like(depth), np.full_like(part, BACKGROUND)
+    made_depth[window], made_part[window] = _corrupt(
+        depth[window].astype(np.float32), part[window], cropped, rng, sensor
+    )
+    return made_depth, made_part
+
+
+def _corrupt(
+    depth: Depth, part: Parts, camera: Intrinsics, rng: np.random.Generator, sensor: Sensor
+) -> tuple[Depth, Parts]:
+    seen = part != BACKGROUND
+    scene = put_behind(depth, camera, rng)
+    mask = seen
+    if sensor.mask == "imperfect":
+        scene, beside = put_beside(scene, seen, rng, sensor.clutter)
+        mask = wrong_mask(seen, camera, rng, sensor.errors) | beside
+    measured, label = scene, part
+    if sensor.noise != "none":
+        shown = surface(scene)
+        if sensor.noise == "kinect":
+            measured, label = kinect(scene, part, camera, rng, sensor.kinect, shown)
+        else:
+            measured, label = disparity(scene, part, camera, rng, sensor.disparity)
+        measured = flying_pixels(measured, shown, rng, sensor.edges)
+        measured = np.where(holes(shown, camera, rng, sensor.edges), 0, measured)
+    kept = mask & (measured > 0)
+    if sensor.mask == "exact":
+        kept &= label != BACKGROUND
+    return np.where(kept, measured, 0), np.where(kept, label, np.uint8(BACKGROUND))
+
+
+def _window(seen: Bool[np.ndarray, "H W"], share: float) -> tuple[slice, slice] | None:
+    """Rows and columns of the object's image with a margin, inside the image."""
+    places = [np.flatnonzero(seen.any(axis)) for axis in (1, 0)]
+    if not len(places[0]):
+        return None
+    margin = LEAST_MARGIN + int(share * max(int(np.ptp(place)) for place in places))
+    rows, columns = (
+        slice(max(int(place[0]) - margin, 0), min(int(place[-1]) + margin + 1, size))
+        for place, size in zip(places, seen.shape, strict=True)
+    )
+    return rows, columns
