@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""The demo's steps and its printed table; the whole demo is run by `make demo`."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bench.demo import Demo, StepError, Steps, cell_text, closing_words, summary
+
+
+def cell(method: str, source: str, column: str, value: str, block: str = "S") -> dict[str, str]:
+    return {"block": block, "method": method, "source": source, "column": column, "value": value}
+
+
+def printed(table: object) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    console.print(table)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_summary_shows_ours_beside_print_for_the_demo_categories_only() -> None:
+    text = printed(
+        summary(
+            Demo(),
+            [
+                cell("SCAPO", "paper", "Laptop", "93.41"),
+                cell("SCAPO (cpu)", "ours", "Laptop", "56.97"),
+                cell("SCAPO (cpu)", "ours", "Oven", ""),
+                cell("EAP", "paper", "Laptop", "86.04"),
+                cell("SCAPO", "paper", "Safe", "89.20"),
+                cell("ICP", "ours", "Oven", "0.0824", "t"),
+            ],
+        )
+    )
+    rows = [[part.strip() for part in line.split("│")[1:-1]] for line in text.splitlines()]
+    rows = [row for row in rows if row]
+    assert rows == [
+        ["S", "SCAPO, paper", "93.41", "–"],
+        ["", "SCAPO (cpu), ours", "56.97", "–"],
+        ["t", "ICP, ours", "–", "0.082"],
+    ]
+
+
+@pytest.mark.parametrize(("value", "text"), [(93.414, "93.41"), (0.0824, "0.082"), (1.0, "1.00")])
+def test_cell_text_keeps_three_digits_of_lengths(value: float, text: str) -> None:
+    assert cell_text(value) == text
+
+
+def test_a_failing_step_names_the_command_its_last_line_and_its_log(tmp_path: Path) -> None:
+    steps = Steps(tmp_path, "laptop", Console(file=io.StringIO()))
+    with pytest.raises(StepError, match=r"scapo-data info ended 1: .*nowhere.*01-info\.txt"):
+        steps.data("info", str(tmp_path / "nowhere"))
+
+
+def test_steps_are_timed_and_logged_one_file_each(tmp_path: Path) -> None:
+    console = Console(file=io.StringIO(), width=200)
+    steps = Steps(tmp_path, "oven", console)
+    steps.data("--help")
+    steps.bench("--help")
+    assert [path.name for path in sorted((tmp_path / "logs").iterdir())] == [
+        "oven-01---help.txt",
+        "oven-02---help.txt",
+    ]
+    assert isinstance(console.file, io.StringIO)
+    assert "scapo-data --help" in console.file.getvalue()
+
+
+def test_closing_words_name_the_folders(tmp_path: Path) -> None:
+    text = closing_words(Demo(out=tmp_path, train=7, epochs=3), 90.0)
+    assert f"{tmp_path}/tables/" in text
+    assert "1.5 minutes: 7 training" in text
+    assert "3 epochs" in text
