@@ -11,7 +11,7 @@ camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol as Interface
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -38,22 +38,19 @@ OPENCV_T_OPENGL = np.diag([1.0, -1.0, -1.0])
 TURN_AWAY = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
 """-90 degrees about y."""
 FULL_FRAME = 0.95
-"""The nearest a camera comes: the object's image fills this share of the picture's longer need."""
+"""Largest share of the picture's side that the object's image fills."""
 
 
-class Wanted(Interface):
-    """What of `samples.Settings` matters here."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """What views depend on."""
 
-    @property
-    def preset(self) -> Preset: ...  # noqa: D102
-    @property
-    def protocol(self) -> Protocol: ...  # noqa: D102
-    @property
-    def camera(self) -> Intrinsics: ...  # noqa: D102
-    @property
-    def states_per_view(self) -> int: ...  # noqa: D102
-    @property
-    def held_out(self) -> bool: ...  # noqa: D102
+    preset: Preset
+    protocol: Protocol
+    camera: Intrinsics
+    states_per_view: int
+    held_out: bool
+    """A test split: eyeglasses then have a published grid of their own."""
 
 
 def draw_preset_views(

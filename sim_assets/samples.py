@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from sim_assets.articulated import ArticulatedObject
 from sim_assets.cloud import Cloud, Surface, sample_frames, truth, visible_pixels
 from sim_assets.noise import Sensor, measure
 from sim_assets.options import Mask, Noise, Preset, Protocol, Sampling
-from sim_assets.preset_views import draw_preset_views
+from sim_assets.preset_views import Wanted, draw_preset_views
 from sim_assets.presets import least_points
 from sim_assets.renderer import AbstractRenderer, Backend, Frame
 from sim_assets.views import Outline, View, generator
@@ -83,6 +83,8 @@ class Shooter:
         self.least = min(LEAST_POINTS, max(1, settings.points // (4 * parts)))
         self.asked = least_points(settings.preset, settings.protocol, parts, settings.points)
         self.sensor = Sensor(noise=settings.noise, mask=settings.mask)
+        shared = {field.name: getattr(settings, field.name) for field in fields(Wanted)}
+        self.wanted = Wanted(**shared)
         if settings.protocol != "full":
             renderer.open(thing)
 
@@ -92,11 +94,10 @@ class Shooter:
         Raises:
             ViewError: No draw of a view was good.
         """
-        settings = self.settings
         for start in range(0, len(keys), BATCH):
             batch = keys[start : start + BATCH]
             rngs = [generator(*key, 0) for key in batch]
-            views = draw_preset_views(self.outline, rngs, settings)
+            views = draw_preset_views(self.outline, rngs, self.wanted)
             for key, rng, view in zip(batch, rngs, views, strict=True):
                 yield self._shoot(key, rng, view)
 
@@ -105,7 +106,7 @@ class Shooter:
         for draws in range(1, MAX_DRAWS + 1):
             if draws > 1:
                 rng = generator(*key, draws - 1)
-                (view,) = draw_preset_views(self.outline, [rng], self.settings)
+                (view,) = draw_preset_views(self.outline, [rng], self.wanted)
             rows = self._rows(view, rng)
             if rows is not None:
                 return Shot(rows=rows, draws=draws, plan=plan)
