@@ -3,8 +3,9 @@
 
 Knows nothing of where the object came from: links carry surfaces in one common frame at rest (the
 root link's), joints their pivot and axis in that frame. Every joint is written with its pivot as
-origin, no rotation, and limits from 0; so the root link's frame is the common frame and zero is
-rest. Equal input gives equal bytes; a folder appears under its name only when complete.
+origin and no rotation; so the root link's frame is the common frame, and zero is the state in
+which the surfaces are given: rest, where limits start at 0. Equal input gives equal bytes; a folder
+appears under its name only when complete.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Joint:
-    """One joint between two links; its state runs from 0 (rest) to `upper`."""
+    """One joint between two links; its state runs from `lower` to `upper`."""
 
     name: str
     kind: JointKind
@@ -64,6 +65,10 @@ class Joint:
     """N m or N."""
     velocity: float = 2.0
     """rad/s or m/s."""
+    lower: float = 0.0
+    """rad or m; below 0 where the surfaces are not given at a limit."""
+    endless: bool = False
+    """A hinge without limits, which then say nothing."""
 
 
 def write_urdf(
@@ -137,11 +142,11 @@ def _check_joint(folder: Path, joint: Joint, reached: set[str]) -> None:
             f"{folder}: joint {joint.name!r}: expected a parent nearer to the root and a new "
             f"child, found {joint.parent!r} -> {joint.child!r}"
         )
-    size = float(np.linalg.norm(joint.axis))
-    if not (abs(size - 1) < 1e-4 and np.isfinite(joint.pivot).all() and joint.upper > 0):
+    size, travel = float(np.linalg.norm(joint.axis)), joint.upper - joint.lower
+    if not (abs(size - 1) < 1e-4 and np.isfinite(joint.pivot).all() and travel > 0):
         raise ValueError(
             f"{folder}: joint {joint.name!r}: expected a unit axis, a finite pivot and a "
-            f"travel > 0, found axis norm {size:.4g}, pivot {joint.pivot}, travel {joint.upper}"
+            f"travel > 0, found axis norm {size:.4g}, pivot {joint.pivot}, travel {travel}"
         )
 
 
@@ -176,22 +181,23 @@ def urdf_text(links: Sequence[Link], joints: Sequence[Joint], name: str = "objec
     for link in links:
         _add_link(robot, link, frames[link.name])
     for joint in joints:
-        node = SubElement(robot, "joint", name=joint.name, type=joint.kind)
+        kind = "continuous" if joint.endless else joint.kind
+        node = SubElement(robot, "joint", name=joint.name, type=kind)
         SubElement(node, "parent", link=joint.parent)
         SubElement(node, "child", link=joint.child)
         SubElement(node, "origin", xyz=_numbers(joint.pivot - frames[joint.parent]), rpy="0 0 0")
         SubElement(node, "axis", xyz=_numbers(joint.axis))
-        SubElement(
-            node,
-            "limit",
-            lower="0",
-            upper=_numbers([joint.upper]),
-            effort=_numbers([joint.effort]),
-            velocity=_numbers([joint.velocity]),
-        )
+        SubElement(node, "limit", _limits(joint))
         SubElement(node, "dynamics", damping="0.1", friction="0.1")
     indent(robot)
     return '<?xml version="1.0"?>\n' + tostring(robot, encoding="unicode") + "\n"
+
+
+def _limits(joint: Joint) -> dict[str, str]:
+    """Attributes of `<limit>`; an endless joint has no ends."""
+    ends = {"lower": _numbers([joint.lower]), "upper": _numbers([joint.upper])}
+    force = {"effort": _numbers([joint.effort]), "velocity": _numbers([joint.velocity])}
+    return force if joint.endless else ends | force
 
 
 def _add_link(robot: Element, link: Link, origin: Vector) -> None:

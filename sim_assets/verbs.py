@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from sim_assets.console import progress_bar, show_made, watched
+from sim_assets.import_verb import Import
 from sim_assets.options import DataOptions
 
 Name = Literal[
@@ -203,6 +204,7 @@ VERBS: dict[str, type] = {
     "build": Build,
     "check": Check,
     "generate": Generate,
+    "import": Import,
     "info": Info,
     "preview": Preview,
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import builtins
 import collections
-import io
 import os
 import pickle  # noqa: TID251 - writes what the reader under test has to face
 import pickletools
@@ -174,7 +173,7 @@ def test_names_are_not_even_imported(name: str):
     with pytest.raises(UnpickleError, match=name.replace(" ", ".")):
         unpickle(data, "x")
     module = "antigravity"
-    with pytest.raises(UnpickleError, match="antigravity.fly"):
+    with pytest.raises(UnpickleError, match=r"antigravity\.fly"):
         unpickle(f"c{module}\nfly\n.".encode(), "x")
     assert module not in sys.modules
 
@@ -232,20 +231,12 @@ def test_deep_and_shared_data():
     assert found[0] is found[1]
 
 
-def array_pickle(shape: object, dtype: object, data: object, state: object = None) -> bytes:
-    """An array's pickle with a state of our choice."""
-    written = io.BytesIO()
-    pickler = pickle.Pickler(written, 2)
-    pickler.dump(Array(shape, dtype, data) if state is None else Array(*state))  # type: ignore
-    return written.getvalue()
-
-
 class Array:
     def __init__(self, shape: object, dtype: object, data: object) -> None:
         self.state = (1, shape, dtype, False, data)
 
     def __reduce__(self) -> Any:
-        function, arguments, _ = np.arange(3).__reduce__()  # type: ignore
+        function, arguments = np.arange(3).__reduce__()[:2]
         return function, arguments, self.state
 
 
@@ -268,7 +259,7 @@ def test_forged_arrays(name: str):
     """States with which numpy itself would read past a buffer, or take bytes for pointers."""
     state, message = FORGED[name]
     with pytest.raises(UnpickleError, match=message):
-        unpickle(array_pickle(*state), "x")
+        unpickle(pickle.dumps(Array(*state), 2), "x")
 
 
 def test_forged_dtype_flags():
@@ -287,12 +278,17 @@ class Forged:
         return np.dtype, self.arguments, self.state
 
 
-@given(st.binary(max_size=60))
-def test_any_bytes_are_read_or_refused(data: bytes):
+def refusal(data: bytes) -> str:
     try:
         unpickle(data, "x")
     except UnpickleError as error:
-        assert str(error).startswith("x: ")
+        return str(error)
+    return "x: read"
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_read_or_refused(data: bytes):
+    assert refusal(data).startswith("x: ")
 
 
 SEEDS = [pickle.dumps([DATA["nested"], ARRAYS["floats"], np.float32(1)], p) for p in PROTOCOLS]
@@ -306,7 +302,4 @@ def test_damaged_pickles_are_read_or_refused(seed: bytes, data: st.DataObject):
         damaged[place] = data.draw(st.integers(0, 255))
     end = data.draw(st.integers(0, len(damaged)))
     for broken in (bytes(damaged), seed[:end]):
-        try:
-            unpickle(broken, "x")
-        except UnpickleError as error:
-            assert str(error).startswith("x: ")
+        assert refusal(broken).startswith("x: ")

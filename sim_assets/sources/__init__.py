@@ -30,6 +30,7 @@ class Traits:
 
 def traits(robot: Robot) -> Traits:
     """By the first set that knows the model as its own; any URDF is generic."""
-    from sim_assets.sources import partnet_mobility, urdf
+    from sim_assets.sources import hoi4d, partnet_mobility, shape2motion, urdf
 
-    return partnet_mobility.traits(robot) or urdf.traits(robot)
+    imported = shape2motion.traits(robot) or hoi4d.traits(robot)
+    return imported or partnet_mobility.traits(robot) or urdf.traits(robot)
