@@ -8,6 +8,7 @@ continues from its last checkpoint with the same batches: on a CPU, bit for bit 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -124,28 +125,34 @@ class Trainer:
         self.order = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(config.device).manual_seed(config.seed)
         self.position = Position()
+        self.finished = False
         self.saved = time.monotonic()
 
     def run(self, *, resume: bool) -> None:
         """All stages that are left."""
-        optimizer_state = self._open(resume=resume)
+        adam = self._open(resume=resume)
+        if self.finished:
+            return
         self.log = Log(self.folder, self.position.step)
+        with contextlib.closing(self.log):
+            self._stages(adam)
+
+    def _stages(self, adam: Arrays | None) -> None:
         stages = self.method.stages()
-        if not stages and self.position.epoch == 0:
+        if not stages:
             self._start(Stage(name="", epochs=0, lr=0.0))
         while self.position.stage < len(stages):
             stage = stages[self.position.stage]
             if self.position.epoch == 0:
                 self._start(stage)
             optimizer = self._optimizer(stage)
-            if optimizer_state is not None:
-                checkpoint.load_adam(optimizer, optimizer_state)
-                optimizer_state = None
+            if adam is not None:
+                checkpoint.load_adam(optimizer, adam)
+                adam = None
             self._stage(stage, optimizer)
             self.position.stage, self.position.epoch = self.position.stage + 1, 0
             self._save(None)
         self._save(None, finished=True)
-        self.log.close()
 
     def _open(self, *, resume: bool) -> Arrays | None:
         """Begin a run, or load the state of the one that is there; Adam's part of it."""
@@ -164,6 +171,7 @@ class Trainer:
         self.order.set_state(torch.from_numpy(arrays["generator/order"].copy()))
         self.noise.set_state(torch.from_numpy(arrays["generator/noise"].copy()))
         self.position = Position(**header["position"])
+        self.finished = header["header"]["finished"]
         return arrays if header["optimizer"] else None
 
     def _check_same(self, path: Path, found: Header) -> None:

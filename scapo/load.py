@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import CATEGORIES, category
@@ -30,13 +29,11 @@ class Predictor:
         self.model = model.to(device).eval()
         self.device = device
 
-    def predict(
-        self, points: Float[np.ndarray, "*B N 3"] | Float[Tensor, "*B N 3"], mode: Mode = "fast"
-    ) -> Prediction:
+    def predict(self, points: np.ndarray | Tensor, mode: Mode = "fast") -> Prediction:
         """Parts, poses and joints of one cloud or of several.
 
         Args:
-            points: Camera frame, metres, numpy or torch.
+            points: (..., N, 3), camera frame, metres, numpy or torch.
             mode: `fast`, networks only, or `refine`.
 
         Returns:

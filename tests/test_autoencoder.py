@@ -136,7 +136,7 @@ def test_batched_patches_equal_one_network_per_patch() -> None:
     for number in range(3):
         x = torch.relu(x / (1 + 1e-5) ** 0.5)  # batch norm as it starts
         layer = made.hidden[number] if number < 2 else made.out
-        x = layer.weight[1] @ x + layer.bias[1, :, 0]  # pyright: ignore[reportIndexIssue, reportOperatorIssue]
+        x = layer.weight[1] @ x + layer.bias[1, :, 0]  # pyright: ignore[reportIndexIssue]
     assert_close(shape[0, 5], torch.tanh(x))
 
 
