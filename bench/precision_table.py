@@ -68,7 +68,7 @@ def table_2(results: Results, cells: Cells, wrong: Sequence[Mismatch], rule: ApR
         groups=(*PRECISION_GROUPS, ("", 1)),
         columns=(*PRECISION_HEADINGS, STATE),
         blocks=tuple(mark_best(block) for block in blocks),
-        notes=(*general_notes(), *budget_notes(results, "sensor")),
+        notes=(*general_notes(), *budget_notes(results, "sensor", TABLE_2_CATEGORIES)),
     )
 
 
@@ -76,7 +76,7 @@ def _row_2(results: Results, series: Series, cells: Sequence[Cell]) -> Row:
     return Row(
         method=display_name(series),
         source="ours",
-        marks=marks_of(results, series, "sensor"),
+        marks=marks_of(results, series),
         cells=tuple(cells),
         ranked=series.method not in REFERENCE and not series.switches,
     )

@@ -8,6 +8,7 @@ instances are drawn with replacement, each with all of its samples.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -91,6 +92,7 @@ def _by_instance(
     return np.bincount(index, total), np.bincount(index, count.astype(np.float64))
 
 
+@lru_cache(maxsize=64)
 def _draws(instances: int, resamples: int, seed: int) -> Int[np.ndarray, "R I"]:
     """How often each instance is drawn in each resample."""
     generator = np.random.default_rng(seed)

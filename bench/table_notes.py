@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from bench.results import Kind, Results, kind_of
 from bench.table_data import METHODS
 
@@ -22,11 +24,15 @@ def general_notes() -> tuple[str, ...]:
     )
 
 
-def budget_notes(results: Results, kind: Kind) -> tuple[str, ...]:
+def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tuple[str, ...]:
     """One line per run series: seeds, data and what its header says of its cost."""
     lines: dict[str, set[int]] = {}
     for run in results.all_runs():
-        if kind_of(run.run.data) != kind or "[" in run.run.variant:
+        if (
+            kind_of(run.run.data) != kind
+            or run.run.category not in categories
+            or "[" in run.run.variant
+        ):
             continue
         budget = run.report.get("budget") or {}
         cost = (

@@ -58,15 +58,17 @@ def listed_series(results: Results, kind: Kind, *, with_order: bool) -> list[Ser
     return sorted(plain + others)
 
 
-def our_row(results: Results, series: Series, parts: Sequence[Sampled | None], kind: Kind) -> Row:
-    """A row of Table 1: a cell per category and their mean."""
+def our_row(
+    results: Results, series: Series, parts: Sequence[Sampled | None], *, mean: bool = True
+) -> Row:
+    """A cell per category and, if wanted, their mean."""
     cells = [Cell() if part is None else part.cell for part in parts]
     seeds = max((len(part.per_seed) for part in parts if part is not None), default=0)
     return Row(
         method=display_name(series),
         source="ours",
-        marks=marks_of(results, series, kind),
-        cells=(*cells, averaged(parts)),
+        marks=marks_of(results, series),
+        cells=(*cells, averaged(parts)) if mean else tuple(cells),
         ranked=series.method not in REFERENCE and not series.switches,
         seeds=seeds,
     )
@@ -84,7 +86,7 @@ def display_name(series: Series) -> str:
     return name
 
 
-def marks_of(results: Results, series: Series, kind: Kind) -> Marks | None:
+def marks_of(results: Results, series: Series) -> Marks | None:
     """The labels that training used, from the reports beside the scores."""
     for run in results.all_runs():
         same = (run.run.method, run.run.variant.partition("[")[0]) == (
@@ -92,7 +94,6 @@ def marks_of(results: Results, series: Series, kind: Kind) -> Marks | None:
         if same and "supervision" in run.report and series.method not in REFERENCE:
             labels = run.report["supervision"]
             return ("pose" in labels, "segmentation" in labels, "joint" in labels)
-    del kind
     return None
 
 

@@ -47,6 +47,11 @@ def scores(tmp_path_factory):
     return folder, kept
 
 
+@pytest.fixture(scope="module")
+def built(scores):
+    return tables.build(load(scores[0]))
+
+
 def rows_of(table, **wanted):
     found = csv.DictReader(io.StringIO(to_csv(table)))
     return [row for row in found if all(row[k] == v for k, v in wanted.items())]
@@ -57,9 +62,9 @@ def one(table, **wanted):
     return row
 
 
-def test_cells_are_means_over_samples_slots_and_seeds(scores):
-    folder, kept = scores
-    table = tables.build(load(folder))[0]
+def test_cells_are_means_over_samples_slots_and_seeds(scores, built):
+    kept = scores[1]
+    table = built[0]
     blocks = {block.heading[0]: block.heading for block in table.blocks}
     for symbol, key, factor in (("S", ("iou", "1"), 100), ("D", ("joint_direction", "deg"), 1),
                                 ("t", ("part_translation", "r4"), 1)):  # fmt: skip
@@ -81,9 +86,9 @@ def test_cells_are_means_over_samples_slots_and_seeds(scores):
         assert float(mean["value"]) == pytest.approx(np.mean(means), rel=1e-6)
 
 
-def test_intervals_are_resampled_by_instance(scores):
-    folder, kept = scores
-    table = tables.build(load(folder))[0]
+def test_intervals_are_resampled_by_instance(scores, built):
+    kept = scores[1]
+    table = built[0]
     row = one(table, block=table.blocks[3].heading, method="ICP", source="ours", column="Laptop")
     values = kept["icp"]["part_rotation", "deg"]
     expected = interval(values, np.arange(SAMPLES) % OBJECTS)
@@ -91,9 +96,8 @@ def test_intervals_are_resampled_by_instance(scores):
     assert float(row["high"]) == pytest.approx(expected.high, rel=1e-6)
 
 
-def test_what_was_not_run_is_a_dash_and_no_mean(scores):
-    folder, _ = scores
-    table = tables.build(load(folder))[0]
+def test_what_was_not_run_is_a_dash_and_no_mean(built):
+    table = built[0]
     heading = table.blocks[0].heading
     assert one(table, block=heading, method="ICP", source="ours", column="Oven")["value"] == ""
     assert one(table, block=heading, method="ICP", source="ours", column="Mean")["value"] == ""
@@ -107,9 +111,8 @@ def test_what_was_not_run_is_a_dash_and_no_mean(scores):
     assert "budget: device cpu, seconds 12.5; seeds 1, 2." in text
 
 
-def test_best_is_bold_among_the_self_supervised(scores):
-    folder, _ = scores
-    table = tables.build(load(folder))[0]
+def test_best_is_bold_among_the_self_supervised(built):
+    table = built[0]
     for block in table.blocks[1:5]:
         best = {
             (row["method"], row["source"])
@@ -127,7 +130,7 @@ def test_best_is_bold_among_the_self_supervised(scores):
 
 def test_the_papers_tables_from_the_same_code():
     """Without scores: every printed cell, in the paper's places."""
-    one_, two, three = tables.build(Results([]))
+    one_, two, three, _ = tables.build(Results([]))
     cells = printed_cells()
     seen = [
         cell.text
@@ -149,7 +152,7 @@ def test_the_papers_tables_from_the_same_code():
     assert [row["value"] for row in ablation] == ["82.77", "4.73", "0.137"]
 
 
-def test_precision_is_k_of_n_and_monotone(scores):
+def test_precision_is_k_of_n_and_monotone(scores, built):
     folder, kept = scores
     for rule in ("mean", "min", "per-part"):
         table = tables.build(load(folder), rule)[1]
@@ -168,7 +171,7 @@ def test_precision_is_k_of_n_and_monotone(scores):
             assert counts[0] <= counts[1]
             assert counts[2:5] == sorted(counts[2:5])
             assert counts[5:8] == sorted(counts[5:8])
-    first = one(tables.build(load(folder))[1], block="Drawer", method="SCAPO", source="ours",
+    first = one(built[1], block="Drawer", method="SCAPO", source="ours",
                 column="Part 10°10cm")  # fmt: skip
     passed = 0
     for seed in (1, 2):
@@ -178,9 +181,19 @@ def test_precision_is_k_of_n_and_monotone(scores):
     assert int(first["k"]) == passed
 
 
-def test_ablations_by_the_end_of_the_variant(scores):
-    folder, _ = scores
-    table = tables.build(load(folder))[2]
+def test_mean_errors_of_all_other_categories(scores, built, tmp_path):
+    kept = scores[1]
+    table = built[3]
+    assert table.columns == tuple(f"{name.capitalize()} (sensor)" for name in TABLE_2_CATEGORIES)
+    row = one(table, block=table.blocks[1].heading, method="SCAPO", column="Drawer (sensor)")
+    values = [kept["scapo", "sensor", "drawer", s]["joint_direction", "deg"] for s in (1, 2)]
+    assert float(row["value"]) == pytest.approx(np.mean(values), rel=1e-6)
+    make_scores(tmp_path, "scapo", "basket")
+    assert tables.build(load(tmp_path))[3].columns[-2:] == ("Suitcase (sensor)", "Basket (clean)")
+
+
+def test_ablations_by_the_end_of_the_variant(built):
+    table = built[2]
     ours = [row for row in table.blocks[0].rows if row.source == "ours"]
     assert [row.method for row in ours] == ["Full", "w/o L_shape-var (wo_shape_var)"]
     assert ours[0].cells[0].value is not None
@@ -213,7 +226,7 @@ def test_latex_compiles_and_golden(scores, tmp_path, repository, update_golden):
         pytest.skip("no pdflatex on this machine")
     folder, _ = scores
     tables.write(load(folder), tmp_path)
-    for number in (1, 2, 3):
+    for number in (1, 2, 3, 4):
         command = [program_, "-interaction=nonstopmode", "-halt-on-error", f"table{number}.tex"]
         done = subprocess.run(
             command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
@@ -270,7 +283,7 @@ def test_without_the_json_the_numbers_are_the_same(scores, tmp_path):
 def test_the_commands(scores, tmp_path, capsys):
     folder, _ = scores
     program.main(["tables", "--scores", str(folder), "--out", str(tmp_path), "--ap-rule", "min"])
-    names = [f"table{n}.{suffix}" for n in (1, 2, 3) for suffix in ("md", "csv", "tex")]
+    names = [f"table{n}.{suffix}" for n in (1, 2, 3, 4) for suffix in ("md", "csv", "tex")]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "significance.csv"])
     capsys.readouterr()
     program.main(["tables", "--check-paper"])
