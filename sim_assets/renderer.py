@@ -102,7 +102,11 @@ def resolve_backend(name: str) -> Backend:
 
 
 def make_renderer(backend: Backend, *, color: bool = False) -> AbstractRenderer:
-    """A renderer of this backend; `color` asks for `Frame.color` too."""
+    """A renderer of this backend; `color` asks for `Frame.color` too.
+
+    Raises:
+        RenderError: It does not work here.
+    """
     if backend == "sapien":
         from sim_assets.scene import SapienRenderer
 

@@ -51,17 +51,16 @@ def make_request(category: str, options: DataOptions) -> tuple[Request, list[Ass
     return request, assets
 
 
-def versions(backend: Backend, protocol: Protocol) -> dict[str, str]:
+def versions(backend: Backend | None, protocol: Protocol) -> dict[str, str]:
     """Versions of what makes the pixels here."""
     names = ["scapo", "numpy", "trimesh"]
     drawn: dict[str, str] = {}
-    if protocol != "full":
-        if backend == "sapien":
-            from sim_assets import scene
+    if protocol != "full" and backend == "raycast":
+        names.append("embreex")
+    elif protocol != "full" and backend == "sapien":
+        from sim_assets import scene
 
-            drawn = scene.versions()
-        else:
-            names.append("embreex")
+        drawn = scene.versions()
     return {**{name: metadata.version(name) for name in names}, **drawn}
 
 
@@ -76,7 +75,7 @@ def _settings(options: DataOptions) -> Settings:
         )
     return Settings(
         protocol=protocol,
-        backend=resolve_backend(options.backend) if needed else "raycast",
+        backend=resolve_backend(options.backend) if needed else None,
         camera=camera(options.preset, options.image_size),
         points=options.points,
         sampling=options.sampling or preset.sampling,

@@ -43,7 +43,8 @@ class Settings:
     protocol: Protocol
     """joint: the whole object in one picture. isolated: a picture of each part alone, merged.
     full: points of the whole surface."""
-    backend: Backend
+    backend: Backend | None
+    """None for `full`, which needs no pictures."""
     camera: Intrinsics
     points: int
     sampling: Sampling
@@ -73,9 +74,9 @@ class Shooter:
     """Makes samples of one object with an open renderer."""
 
     def __init__(
-        self, renderer: AbstractRenderer, thing: ArticulatedObject, settings: Settings
+        self, renderer: AbstractRenderer | None, thing: ArticulatedObject, settings: Settings
     ) -> None:
-        """Open the object in the renderer (not for `full`, which needs no picture)."""
+        """Open the object in the renderer, if there is one."""
         self.renderer, self.thing, self.settings = renderer, thing, settings
         self.outline = Outline(thing)
         self.surface = Surface(thing)
@@ -85,7 +86,7 @@ class Shooter:
         self.sensor = Sensor(noise=settings.noise, mask=settings.mask)
         shared = {field.name: getattr(settings, field.name) for field in fields(Wanted)}
         self.wanted = Wanted(**shared)
-        if settings.protocol != "full":
+        if renderer is not None:
             renderer.open(thing)
 
     def shots(self, keys: Sequence[tuple[object, ...]]) -> Iterator[Shot]:
@@ -129,13 +130,13 @@ class Shooter:
     def _row(self, state: np.ndarray, view: View, rng: np.random.Generator) -> Row | None:
         settings = self.settings
         known = truth(self.thing, state, view.camera_T_object)
-        if settings.protocol == "full":
+        if self.renderer is None:
             visible = np.ones(len(known.camera_T_part))
             cloud = self.surface.sample(
                 known.camera_T_part, settings.points, self.least, rng, settings.sampling
             )
         else:
-            frames = self._frames(state, view)
+            frames = self._frames(self.renderer, state, view)
             sensed = [measure(frame, settings.camera, rng, self.sensor) for frame in frames]
             seen = visible_pixels(sensed)
             if sum(len(pixels) for pixels in seen) < LEAST_PIXELS:
@@ -162,12 +163,12 @@ class Shooter:
         per_part = np.bincount(cloud.part, minlength=parts)[:parts]
         return bool((per_part >= np.maximum(self.least, self.asked)).all())
 
-    def _frames(self, state: np.ndarray, view: View) -> list[Frame]:
+    def _frames(self, renderer: AbstractRenderer, state: np.ndarray, view: View) -> list[Frame]:
         camera = self.settings.camera
         if self.settings.protocol == "joint":
-            return [self.renderer.render(state, view.camera_T_object, camera)]
+            return [renderer.render(state, view.camera_T_object, camera)]
         parts = range(len(self.thing.visuals))
-        return [self.renderer.render(state, view.camera_T_object, camera, part) for part in parts]
+        return [renderer.render(state, view.camera_T_object, camera, part) for part in parts]
 
 
 def _cloud_row(cloud: Cloud, color: bool) -> Row:

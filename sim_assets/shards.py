@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from scapo.store import SAMPLES, read_header, write
 from sim_assets.assets import Asset
 from sim_assets.plan import Entry, Piece, Request, ShardPlan, instance_record
 from sim_assets.renderer import AbstractRenderer, Backend, make_renderer
+from sim_assets.request import versions
 from sim_assets.samples import Row, Shooter, Shot, geometry_digest
 
 
@@ -82,6 +84,27 @@ def render_shard(job: ShardJob, report: Report) -> ShardDone:
     return _write(job, rows, shots, failed)
 
 
+def render_shard_alike(job: ShardJob, report: Report) -> ShardDone:
+    """The same on another machine, which must make the same pixels.
+
+    Raises:
+        ValueError: What makes the pixels here has other versions than where the data set was begun.
+    """
+    settings = job.request.settings
+    found = _versions(settings.backend, settings.protocol)
+    if found != job.versions:
+        names = sorted(n for n in {*found, *job.versions} if found.get(n) != job.versions.get(n))
+        expected, there = (
+            ", ".join(f"{name} {what.get(name)}" for name in names)
+            for what in (job.versions, found)
+        )
+        raise ValueError(f"machine {gethostname()}: expected {expected}, found {there}")
+    return render_shard(job, report)
+
+
+_versions = lru_cache(maxsize=4)(versions)
+
+
 def render_piece(request: Request, piece: Piece, report: Report) -> tuple[list[Shot], list[Row]]:
     """Samples of one object, with the instance index added.
 
@@ -110,8 +133,8 @@ def render_piece(request: Request, piece: Piece, report: Report) -> tuple[list[S
 
 
 @lru_cache(maxsize=1)
-def _renderer(backend: Backend, color: bool) -> AbstractRenderer:
-    return make_renderer(backend, color=color)
+def _renderer(backend: Backend | None, color: bool) -> AbstractRenderer | None:
+    return None if backend is None else make_renderer(backend, color=color)
 
 
 def _write(job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, str]) -> ShardDone:

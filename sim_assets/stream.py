@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -28,7 +29,9 @@ def stream(category: str, **options: Any) -> Iterator[Sample]:  # noqa: ANN401
 def _samples(request: Request, assets: Sequence[Asset]) -> Iterator[Sample]:
     settings = request.settings
     each = samples_per_instance(request, len(assets))
-    with make_renderer(settings.backend, color=settings.color) as renderer:
+    backend = settings.backend
+    opened = nullcontext() if backend is None else make_renderer(backend, color=settings.color)
+    with opened as renderer:
         for number, asset in enumerate(assets):
             first, last = number * each, min((number + 1) * each, request.count)
             if first >= last:
