@@ -216,7 +216,9 @@ def _render(
 def _without(outcome: Outcome[ShardJob, ShardDone], strict: bool) -> ShardJob:
     """The job again, without the object at which its worker died or hung."""
     job = outcome.job
-    if strict or outcome.failure == "error" or not outcome.label or outcome.label in job.skip:
+    if outcome.failure == "error" and not strict:  # of writing: objects are left out in the job
+        raise GenerateError(outcome.reason)
+    if strict or not outcome.label or outcome.label in job.skip:
         raise GenerateError(_reason(outcome.label or job.plan.file, outcome))
     return replace(job, skip={**job.skip, outcome.label: outcome.reason})
 

@@ -73,8 +73,17 @@ class Ledger:
             raise
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        os.close(self._lock)  # which unlocks
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        """Unlock.
+
+        Raises:
+            GenerateError: In place of an OSError, which need not say where it arose.
+        """
+        os.close(self._lock)
+        if isinstance(error, OSError):
+            raise GenerateError(
+                f"{self.folder}: expected to be written to, found: {error.strerror or error}"
+            ) from error
 
     def entries(self, assets: Sequence[Asset]) -> tuple[tuple[Entry, ...], dict[str, str]] | None:
         """The objects as first read and those refused, if that was recorded."""

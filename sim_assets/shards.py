@@ -157,7 +157,11 @@ def _write(job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, 
         **done,
     }
     arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} if rows else {}
-    sha256 = write(job.folder / job.plan.file, arrays, header)
+    path = job.folder / job.plan.file
+    try:
+        sha256 = write(path, arrays, header)
+    except OSError as error:
+        raise OSError(f"{path}: expected to be written, found: {error.strerror}") from error
     return ShardDone(file=job.plan.file, sha256=sha256, **done)
 
 
