@@ -102,7 +102,8 @@ def data_name(folder: Path, split: Split) -> str:
     elif inside or above.name in ("clean", "sensor"):
         name = above.name
     else:
-        name = "clean" if manifest.options.get("noise", "none") == "none" else "sensor"
+        noisy = manifest.options.get("noise", "none") != "none"
+        name = "sensor" if noisy else "clean"
     return f"{name}@{manifest.digest[:12]}"
 
 

@@ -101,7 +101,7 @@ def load(folder: Path) -> Results:
 def kind_of(data: str) -> Kind:
     """Which tables the data belong to, from the name before the `@`."""
     name = data.partition("@")[0].rpartition("/")[2]
-    return "sensor" if name == "sensor" or name.startswith("op-align-real") else "clean"
+    return "sensor" if name.endswith("sensor") or name.startswith("op-align-real") else "clean"
 
 
 def series_of(scores: Scores) -> Series:
