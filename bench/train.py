@@ -50,9 +50,10 @@ class Train(Generic[M]):
     def run(self, console: Console) -> None:
         """Read the split, build the method, fit it with a progress bar."""
         name = next(name for name, entry in METHODS.items() if isinstance(self.method, entry.kind))
+        kind = category(self.category)
         split = open_split(self.data, self.category, self.split)
         generator = torch.Generator().manual_seed(self.seed)
-        method = METHODS[name].build(self.method, category(self.category), generator)
+        method = METHODS[name].build(self.method, kind, generator)
         config = fit.FitConfig(
             seed=self.seed,
             device=pick_device(self.device),

@@ -211,7 +211,7 @@ class Trainer:
             for number, index in enumerate(order.split(size)):
                 done = (epoch * steps + number) / (stage.epochs * steps)
                 self._step(stage, optimizer, index, done)
-                self.listener(self._progress(stage, epoch, done))
+                self.listener(Progress(stage=stage, epoch=epoch, done=done, loss=self.log.latest))
             self.log.write(self.position.step, stage.name)
             self.position.epoch = epoch + 1
             seconds = time.monotonic() - began
@@ -220,9 +220,6 @@ class Trainer:
             self.log.scalar("samples_per_second", steps * size / seconds, self.position.step)
             if time.monotonic() - self.saved > self.config.checkpoint_every:
                 self._save(optimizer)
-
-    def _progress(self, stage: Stage, epoch: int, done: float) -> Progress:
-        return Progress(stage=stage, epoch=epoch, done=done, loss=self.log.latest)
 
     def _step(self, stage: Stage, optimizer: torch.optim.Adam, index: Tensor, done: float) -> None:
         """One batch."""

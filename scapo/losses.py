@@ -136,7 +136,7 @@ def boundary_direction(
     with several joints only points between the base and `child`, and a sample with fewer than 16
     of them has no direction (second result False).
     """
-    count = max(16, points.shape[1] // 10)
+    count = min(max(16, points.shape[1] // 10), points.shape[1])
     between = boundary_of_joint(weights, child)
     order = torch.where(between, entropy(weights), -1.0).topk(count, dim=1).indices
     chosen = gather(points, order)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plates import plates
+from hinged import plates
 from tiny import TINY, tiny
 from torch.testing import assert_close
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from plates import plates
+from hinged import plates
 from strategies import generator, rigid_motions
 from tiny import TINY, tiny
 from torch.testing import assert_close

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from plates import plates
+from hinged import plates
 from strategies import generator
 
 from scapo.articulation import HeadConfig, JointConfig

@@ -254,7 +254,7 @@ class Icp(OracleMethod):
         return replace(match, residual=residual)
 
 
-def thin(points: Points, count: int) -> Points:
+def thin(points: Points, count: int) -> Float[np.ndarray, "K 3"]:
     """At least `count` of the points, evenly taken from their order; all where there are fewer."""
     return points[:: max(1, len(points) // count)]
 
