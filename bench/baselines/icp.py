@@ -11,6 +11,7 @@ Lengths are in units of the whole cloud's mean radius, so sizes of instances do 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -216,7 +217,9 @@ class Icp(OracleMethod):
             if len(points) >= FEWEST and search and candidates:
                 best = self._register(points, candidates)
             elif len(points) >= FEWEST and own:
-                best = self._settle(thin(points, self.config.points), own[0], match.pose)
+                best = self._settle(
+                    thin(points, self.config.points), own[0], match.pose, exact=True
+                )
             template = self.template_pose[best.template, p].cpu().double().numpy()
             poses.append(np.linalg.inv(best.pose) @ template)
         return np.stack(poses)
@@ -235,10 +238,12 @@ class Icp(OracleMethod):
             first[:3, :3] = self.rotations[k]
             first[:3, 3] = targets[which].centre - self.rotations[k] @ points.mean(0)
             found.append(self._settle(points, targets[which], first))
-        return min(found, key=lambda match: match.residual)
+        best = min(found, key=lambda match: match.residual)
+        target = next(target for target in targets if target.number == best.template)
+        return self._settle(points, target, best.pose, exact=True)
 
-    def _settle(self, points: Points, target: Target, first: Pose) -> Match:
-        """Point-to-point ICP from `first`."""
+    def _settle(self, points: Points, target: Target, first: Pose, *, exact: bool = False) -> Match:
+        """Point-to-point ICP from `first`, to steps ten times smaller where it must be `exact`."""
         reach = self.config.reach * MEAN_RADIUS
         result = small_gicp.align(
             target.cloud,
@@ -247,7 +252,9 @@ class Icp(OracleMethod):
             first,
             registration_type="ICP",
             max_correspondence_distance=reach,
-            max_iterations=self.config.iterations,
+            max_iterations=self.config.iterations * (5 if exact else 1),
+            rotation_epsilon=math.radians(0.01 if exact else 0.1),
+            translation_epsilon=1e-4 if exact else 1e-3,
         )
         match = Match(template=target.number, pose=result.T_target_source, residual=np.inf)
         residual = float(np.sqrt(target.squares(match.move(points), reach).mean()))
