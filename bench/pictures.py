@@ -10,6 +10,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.metrics import sample_errors
@@ -38,7 +39,29 @@ def predictions_picture(
     predicted, header = store.read(predictions, store.PREDICTIONS)
     predicted = {name: array[index] for name, array in predicted.items()}
     part_true = np.where(truth["part"] == UNLABELLED, -1, truth["part"].astype(np.int64))
-    part_pred = hard_parts(predicted)
+    part_shown = as_compared(truth, part_true, hard_parts(predicted))
+    figure = Figure(figsize=(1.9 * len(index), 4.3), dpi=130)
+    grid = figure.subplots(2, len(index), squeeze=False)
+    for column, number in enumerate(index):
+        points = truth["points"][column].astype(np.float64)
+        above, below = grid[:, column]
+        draw_cloud(above, points, part_true[column])
+        draw_cloud(below, points, part_shown[column])
+        for axes in (above, below):
+            draw_joints(axes, points, truth, column, color=TRUE_AXIS)
+        draw_joints(below, points, predicted, column, color=PREDICTED_AXIS)
+        above.set_title(f"#{number}", fontsize=8)
+    figure.suptitle(
+        f"{header['category']}: truth above, {header['method']} below "
+        "(axis: true dashed, predicted red)",
+        fontsize=10,
+    )
+    figure.tight_layout(rect=(0, 0, 1, 0.96))
+    save(figure, out)
+
+
+def as_compared(truth: store.Arrays, part_true: np.ndarray, part_pred: np.ndarray) -> np.ndarray:
+    """Predicted parts (B, N) renamed to the true parts that the evaluator compares them with."""
     order = sample_errors(
         part_true=part_true,
         camera_T_part_true=truth["camera_T_part"],
@@ -49,31 +72,18 @@ def predictions_picture(
         pivot_pred=None,
         axis_pred=None,
     )["order"]
-    figure = Figure(figsize=(1.9 * len(index), 4.3), dpi=130)
-    grid = figure.subplots(2, len(index), squeeze=False)
-    for column in range(len(index)):
-        points = truth["points"][column].astype(np.float64)
-        draw_cloud(grid[0, column], points, part_true[column])
-        draw_cloud(grid[1, column], points, order[column][part_pred[column]])
-        for row in (0, 1):
-            for pivot, axis in zip(
-                truth["joint_pivot"][column], truth["joint_axis"][column], strict=True
-            ):
-                draw_axis(grid[row, column], points, pivot, axis, color=TRUE_AXIS, dashed=True)
-        if "joint_axis" in predicted:
-            pairs = zip(
-                predicted["joint_pivot"][column], predicted["joint_axis"][column], strict=True
-            )
-            for pivot, axis in pairs:
-                draw_axis(grid[1, column], points, pivot, axis, color=PREDICTED_AXIS)
-        grid[0, column].set_title(f"#{index[column]}", fontsize=8)
-    figure.suptitle(
-        f"{header['category']}: truth above, {header['method']} below "
-        "(axis: true dashed, predicted red)",
-        fontsize=10,
-    )
-    figure.tight_layout(rect=(0, 0, 1, 0.96))
-    save(figure, out)
+    return np.take_along_axis(order, part_pred, axis=1)
+
+
+def draw_joints(
+    axes: Axes, points: np.ndarray, arrays: store.Arrays, sample: int, *, color: str
+) -> None:
+    """The axes of one sample's joints where the arrays have any; the true ones dashed."""
+    if "joint_axis" not in arrays or "joint_pivot" not in arrays:
+        return
+    pairs = zip(arrays["joint_pivot"][sample], arrays["joint_axis"][sample], strict=True)
+    for pivot, axis in pairs:
+        draw_axis(axes, points, pivot, axis, color=color, dashed=color == TRUE_AXIS)
 
 
 def hard_parts(predicted: store.Arrays) -> np.ndarray:
