@@ -21,8 +21,8 @@ FOCAL = 600.0
 class MaskErrors:
     """How wrong the mask is."""
 
-    grow: float = 3.0
-    """Largest growth (dilation) or shrinkage (erosion) of the whole outline, pixels."""
+    grow: tuple[float, float] = (-2.0, 4.0)
+    """Least and largest growth (dilation; negative: erosion) of the whole outline, pixels."""
     waves: float = 1.5
     """Standard deviation of the outline's local displacement along each axis, pixels."""
     wavelength: float = 24.0
@@ -51,7 +51,7 @@ def wrong_mask(
         model: Kinds and sizes.
     """
     pixel = camera.fx / FOCAL
-    grow = round(rng.uniform(-model.grow, model.grow) * pixel)
+    grow = round(rng.uniform(*model.grow) * pixel)
     made = shrink(mask, -grow) if grow < 0 else grow_mask(mask, grow)
     du, dv = (
         model.waves * pixel * _smooth(mask.shape, model.wavelength * pixel, rng) for _ in range(2)

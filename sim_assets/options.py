@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+SplitName = Literal["train", "val", "test", "test-ood"]
 Protocol = Literal["joint", "isolated", "full"]
 Sampling = Literal["random", "fps"]
 Noise = Literal["none", "kinect", "disparity"]
@@ -25,7 +26,7 @@ class DataOptions:
     """Models: which axis the front (door, drawer, user side) faces; default: the source's."""
     scale: float | None = None
     """Models: metres per unit of the URDF; default: the source's."""
-    split: Literal["train", "val", "test", "test-ood"] = "train"
+    split: SplitName = "train"
     """Splits share no instance. Models are divided by a hash of their name, 70:10:20, where the
     folder has no splits of its own; fewer than ten go whole into the split asked for."""
     count: int = 1000
