@@ -1,41 +1,46 @@
 # SPDX-License-Identifier: MIT
-"""Depth images of flat plates, computed from the plane's equation."""
+"""Two hinged plates, the smallest articulated object, as clouds with full labels."""
 
 from __future__ import annotations
 
-import numpy as np
+import torch
+from strategies import generator
+from torch import Tensor
 
-from scapo.camera import Intrinsics
-
-
-def camera(size: int = 160, focal: float = 585.0) -> Intrinsics:
-    return Intrinsics(fx=focal, fy=focal, cx=size / 2, cy=size / 2, width=size, height=size)
-
-
-def plate(seen_by: Intrinsics, z: float, degrees: float, turn: float = 0.3) -> np.ndarray:
-    """A plane that meets the optical axis at z, its normal tilted by `degrees` from that axis."""
-    tilt = np.radians(degrees)
-    normal = [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), -np.cos(tilt)]
-    x = (np.arange(seen_by.width) + 0.5 - seen_by.cx) / seen_by.fx
-    y = (np.arange(seen_by.height)[:, None] + 0.5 - seen_by.cy) / seen_by.fy
-    return (normal[2] * z / (normal[0] * x + normal[1] * y + normal[2])).astype(np.float32)
+from scapo.geometry import apply, joint_motion, random_rotations, rigid
+from scapo.types import Joints, Labels, Observation
 
 
-def angles(seen_by: Intrinsics, degrees: float, turn: float = 0.3) -> np.ndarray:
-    """Between the plate's normal and each ray, rad."""
-    tilt = np.radians(degrees)
-    x = (np.arange(seen_by.width) + 0.5 - seen_by.cx) / seen_by.fx
-    y = (np.arange(seen_by.height)[:, None] + 0.5 - seen_by.cy) / seen_by.fy
-    along = np.sin(tilt) * (np.cos(turn) * x + np.sin(turn) * y) - np.cos(tilt)
-    return np.arccos(-along / np.sqrt(x * x + y * y + 1))
+def plates(count: int, points: int = 256, seed: int = 0) -> tuple[Observation, Labels]:
+    """`count` clouds in the camera frame, metres: base 0, lid 1, hinge along x, 40 to 140 degrees.
 
+    Width and depth vary; every cloud has a pose of its own about two metres from the camera.
+    """
+    g = generator(seed)
 
-def disc(seen_by: Intrinsics, share: float = 0.35) -> np.ndarray:
-    """Pixels within this share of the image's side from its centre."""
-    u, v = np.arange(seen_by.width)[None], np.arange(seen_by.height)[:, None]
-    radius = np.hypot(u + 0.5 - seen_by.cx, v + 0.5 - seen_by.cy)
-    return radius < share * min(seen_by.width, seen_by.height)
+    def between(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(count, *shape, generator=g)
 
-
-def parts_of(depth: np.ndarray) -> np.ndarray:
-    return np.where(depth > 0, 0, 255).astype(np.uint8)
+    flat = (
+        between(-0.5, 0.5, points, 2)
+        * torch.stack([between(0.8, 1.2), between(0.5, 0.8)], -1)[:, None]
+    )
+    depth = flat[..., 1:].amax(1, keepdim=True)
+    closed = torch.cat([flat[..., :1], flat[..., 1:] + depth, torch.zeros(count, points, 1)], -1)
+    part = (torch.rand(count, points, generator=g) < 0.5).long()
+    pivot, axis = torch.zeros(count, 3), torch.tensor([1.0, 0, 0]).expand(count, 3)
+    state = between(0.7, 2.4)
+    opened = apply(joint_motion(pivot, axis, state, "revolute"), closed)
+    posed = torch.where(part[..., None] == 1, opened, closed)
+    shift = torch.tensor([0, 0, 2.0]) + 0.1 * torch.randn(count, 3, generator=g)
+    camera_T_base = rigid(random_rotations(count, g), shift)
+    camera_T_lid = camera_T_base @ joint_motion(pivot, axis, state, "revolute")
+    joints = Joints(
+        pivot=apply(camera_T_base, pivot[:, None]),
+        axis=(camera_T_base[:, :3, :3] @ axis[..., None]).mT,
+        state=state[:, None],
+    )
+    labels = Labels(
+        part=part, camera_T_part=torch.stack([camera_T_base, camera_T_lid], 1), joints=joints
+    )
+    return Observation(points=apply(camera_T_base, posed)), labels

@@ -18,7 +18,7 @@ from sim_assets.noise_mask import MaskErrors
 from sim_assets.noise_scene import Clutter
 from sim_assets.options import Mask, Noise
 from sim_assets.renderer import Frame
-from tests.plates import disc, plate
+from tests.depth_plates import disc, plate
 
 CAMERA = Intrinsics(fx=600, fy=600, cx=160, cy=120, width=320, height=240)
 EVERY = [(noise, mask) for noise in get_args(Noise) for mask in get_args(Mask)]

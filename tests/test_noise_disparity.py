@@ -15,7 +15,7 @@ from sim_assets.noise_disparity import (
     depth_step,
     disparity,
 )
-from tests.plates import camera, disc, parts_of, plate
+from tests.depth_plates import camera, disc, parts_of, plate
 
 CAMERA = camera(200)
 QUIET = Disparity(sigma=0, shift=0, rounded=False)

@@ -8,7 +8,7 @@ import pytest
 
 from sim_assets.noise_edges import Edges, flying_pixels, holes
 from sim_assets.noise_surface import edges, surface
-from tests.plates import camera, plate
+from tests.depth_plates import camera, plate
 
 CAMERA = camera(200)
 QUIET = Edges(flying=0, lost=0, grazing=None)

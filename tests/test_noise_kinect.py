@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim_assets.noise_kinect import Kinect, axial_sigma, kinect, lateral_sigma
-from tests.plates import angles, camera, disc, parts_of, plate
+from tests.depth_plates import angles, camera, disc, parts_of, plate
 
 CAMERA = camera(200)
 QUIET = Kinect(axial=0, axial_square=0, axial_angle=0, lateral=0, lateral_angle=0)

@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import binary_dilation, distance_transform_edt, generate_binary_structure
 
 from sim_assets.noise_mask import MaskErrors, grow_mask, shrink, wrong_mask
-from tests.plates import camera, disc
+from tests.depth_plates import camera, disc
 
 CAMERA = camera(200, 600)
 QUIET = MaskErrors(grow=(0, 0), waves=0, missed=0)

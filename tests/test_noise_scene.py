@@ -7,7 +7,7 @@ import numpy as np
 
 from sim_assets.noise_scene import FARTHEST, Clutter, put_behind, put_beside
 from sim_assets.noise_surface import rays
-from tests.plates import camera, disc, plate
+from tests.depth_plates import camera, disc, plate
 
 CAMERA = camera(120, 400)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim_assets.noise_surface import edges, incidence, surface
-from tests.plates import angles, camera, plate
+from tests.depth_plates import angles, camera, plate
 
 CAMERA = camera()
 
