@@ -35,6 +35,7 @@ from scapo.geometry import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
 from scapo.objectives import Explanation, LossConfig, articulation, canonicalisation
 from scapo.points import Similarity, normalise
+from scapo.refine import refine
 from scapo.skinning import Bones, cross_maps, part_maps
 from scapo.types import Category, JointKind, Joints, Labels, Observation, Prediction, Supervision
 from scapo.vector_neurons import initialise
@@ -250,10 +251,13 @@ class Scapo(AbstractMethod):
         """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (PROTOCOL 4.4).
 
         The part frames are the template's: every part's pose carries the template onto the
-        cloud. States are those of the cloud minus the template's.
+        cloud. States are those of the cloud minus the template's. `refine` moves pose and joints
+        of each cloud until the posed template fits it (not in the paper).
         """
         points, similarity = normalise(observation.points)
         explanation = self.explain(points)
+        if mode == "refine":
+            explanation = refine(points, explanation, self.kinds)
         encoding, joints = explanation.encoding, explanation.joints
         maps = part_maps(cross_maps(explanation.template_joints, joints, self.kinds))
         pose = rigid(encoding.rotation, encoding.translation)[:, None] @ maps
