@@ -23,6 +23,7 @@ carried along by the part. `a_T_b` maps coordinates in b to a; points are rows.
 """
 
 from scapo.categories import CATEGORIES, category
+from scapo.predictor import load
 from scapo.types import (
     Category,
     Joints,
@@ -45,4 +46,5 @@ __all__ = [
     "Sample",
     "SampleKey",
     "category",
+    "load",
 ]

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from scapo.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.layout import StoreError
-from scapo.load import load
+from scapo.predictor import load
 from scapo.types import Observation
 
 
