@@ -23,6 +23,7 @@ from sim_assets.views import generator
 
 SURFACE_SAMPLES = 512
 """Per part, for `visible`: its standard error is 0.02 or less."""
+FPS_POOL = 16
 TOLERANCE = 1e-3
 """Of the object's diagonal: how far from the picture's surface a surface sample counts as seen."""
 
@@ -119,7 +120,14 @@ def choose(available: int, count: int, rng: np.random.Generator) -> Int[np.ndarr
 def choose_far(
     points: Float[np.ndarray, "K 3"], count: int, rng: np.random.Generator
 ) -> Int[np.ndarray, " N"]:
-    """Indices by farthest-point sampling from a random start; filled up by random ones."""
+    """Indices by farthest-point sampling from a random start; filled up by random ones.
+
+    From FPS_POOL times as many points as wanted, drawn at random, where there are more: that makes
+    no visible difference and is as much faster as there are more.
+    """
+    if len(points) > FPS_POOL * count:
+        pool = choose(len(points), FPS_POOL * count, rng)
+        return pool[choose_far(points[pool], count, rng)]
     start = int(rng.integers(len(points)))
     far = farthest_points(torch.from_numpy(points), min(count, len(points)), start=start).numpy()
     return np.concatenate([far, rng.integers(len(points), size=count - len(far))])
