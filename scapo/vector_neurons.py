@@ -9,7 +9,7 @@ layers made with `affine=True` also give f(x + t) = f(x) + t for every vector t 
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -46,6 +46,57 @@ def initialise(module: nn.Module, generator: torch.Generator) -> None:
                 uniform(child.bias, bound, generator)
         elif callable(reset := getattr(child, "reset", None)):
             reset(generator)
+
+
+class Rectify(torch.autograd.Function):
+    """x - min(x.d, 0) / |d|^2 d over the coordinate axis, its gradient by hand in half the time."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, d: Tensor) -> Tensor:  # noqa: ANN401
+        """x and direction d, (..., 3, C)."""
+        inverse = ((d * d).sum(-2, keepdim=True) + 1e-6).reciprocal_()
+        share = (x * d).sum(-2, keepdim=True).clamp_(max=0).mul_(inverse)
+        ctx.save_for_backward(x, d, share, inverse)
+        return torch.addcmul(x, share, d, value=-1)
+
+    @staticmethod
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any,  # noqa: ANN401
+        gradient: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """To x and d."""
+        x, d, share, inverse = ctx.saved_tensors
+        along = (gradient * d).sum(-2, keepdim=True) * inverse * (share < 0)
+        to_x = torch.addcmul(gradient, along, d, value=-1)
+        to_d = (gradient * -share).addcmul_(x, along, value=-1).addcmul_(d, 2 * along * share)
+        return to_x, to_d
+
+
+class ScaleToUnit(torch.autograd.Function):
+    """Vectors over the root mean square length of their channel, and that mean square."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ANN401
+        """x (..., 3, C); the mean square is (C,)."""
+        rows = x.flatten(0, -2)
+        mean_square = 3 * (rows * rows).mean(0)
+        scale = (mean_square + TINY).rsqrt()
+        ctx.save_for_backward(x, scale)
+        ctx.mark_non_differentiable(mean_square)
+        return x * scale, mean_square
+
+    @staticmethod
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any,  # noqa: ANN401
+        gradient: Tensor,
+        unused: Tensor,
+    ) -> Tensor:
+        """To x; the mean square has none."""
+        del unused
+        x, scale = ctx.saved_tensors
+        rows = x.shape[:-1].numel()
+        along = (gradient * x).flatten(0, -2).sum(0) * (3 / rows) * scale.pow(3)
+        return (gradient * scale).addcmul_(x, along, value=-1)
 
 
 class VNLinear(nn.Module):
@@ -86,14 +137,14 @@ class VectorScale(nn.Module):
         self.gain = nn.Parameter(torch.ones(channels))
         self.register_buffer("mean_square", torch.ones(channels))
 
-    def forward(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, " C"]:
-        """The factor of each channel."""
+    def forward(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, "*B 3 C"]:
+        """The vectors with a root mean square length of the gain per channel."""
         if not self.training:
-            return self.gain * (self.mean_square + TINY).rsqrt()
-        mean_square = 3 * x.flatten(0, -2).square().mean(0)
+            return x * (self.gain * (self.mean_square + TINY).rsqrt())
+        out, mean_square = ScaleToUnit.apply(x)
         with torch.no_grad():
-            self.mean_square.lerp_(mean_square.detach(), 0.1)
-        return self.gain * (mean_square + TINY).rsqrt()
+            self.mean_square.lerp_(mean_square, 0.1)
+        return out * self.gain
 
 
 class VNBatchNorm(nn.Module):
@@ -116,7 +167,7 @@ class VNBatchNorm(nn.Module):
         centre = x.mean(-1, keepdim=True) if self.affine else None
         x = x if centre is None else x - centre
         if isinstance(self.norm, VectorScale):
-            x = x * self.norm(x)
+            x = self.norm(x)
         else:
             length = (x.square().sum(-2) + TINY).sqrt()  # (..., C)
             x = x * (self.norm(length.flatten(0, -2)).view_as(length) / length)[..., None, :]
@@ -127,8 +178,7 @@ def rectify(
     x: Float[Tensor, "*B 3 C"], direction: Float[Tensor, "*B 3 C"]
 ) -> Float[Tensor, "*B 3 C"]:
     """ReLU of vectors: where x points against its direction, that component is removed."""
-    along = (x * direction).sum(-2, keepdim=True).clamp(max=0)
-    return x - along / (direction.square().sum(-2, keepdim=True) + 1e-6) * direction
+    return Rectify.apply(x, direction)
 
 
 class VNBlock(nn.Module):

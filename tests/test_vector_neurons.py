@@ -125,3 +125,11 @@ def test_centres_of_a_cloud_with_few_different_points() -> None:
     points = torch.zeros(1, 50, 3)
     points[0, 0, 0] = 1.0
     assert vn.spread_centres(points, 5, 50).shape == (1, 5)
+
+
+def test_gradients_by_hand_are_the_numerical_ones() -> None:
+    x, d = normal(1, 4, 3, 5).requires_grad_(), normal(2, 4, 3, 5).requires_grad_()
+    assert torch.autograd.gradcheck(vn.rectify, (x, d))
+    assert torch.autograd.gradcheck(lambda x: vn.ScaleToUnit.apply(x)[0], (x,))
+    wanted = x / (3 * x.square().mean((0, 1))).sqrt()
+    assert_close(vn.ScaleToUnit.apply(x)[0], wanted)
