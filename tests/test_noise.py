@@ -40,7 +40,9 @@ def picture() -> tuple[np.ndarray, np.ndarray]:
 def test_the_result_depends_on_the_generator_alone(picture, noise, mask):
     before = [array.copy() for array in picture]
     sensor = Sensor(noise=noise, mask=mask)
-    made = [corrupt(*picture, CAMERA, np.random.default_rng(s), sensor) for s in (7, 7, 8)]
+    made = [
+        corrupt(picture[0], picture[1], CAMERA, np.random.default_rng(s), sensor) for s in (7, 7, 8)
+    ]
     for k in range(2):
         assert np.array_equal(made[0][k], made[1][k])
         assert np.array_equal(picture[k], before[k])  # the input is left alone
@@ -102,7 +104,7 @@ def test_a_sensor_without_errors_returns_the_picture(picture, noise):
         clutter=Clutter(chance=0),
         errors=MaskErrors(grow=(0, 0), waves=0, missed=0),
     )
-    found, label = corrupt(*picture, CAMERA, np.random.default_rng(0), sensor)
+    found, label = corrupt(picture[0], picture[1], CAMERA, np.random.default_rng(0), sensor)
     assert np.array_equal(found, picture[0])
     assert np.array_equal(label, picture[1])
 

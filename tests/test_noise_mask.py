@@ -37,7 +37,8 @@ def test_the_outline_grows_or_shrinks_by_that_many_pixels(pixels, focal):
 def test_waves_move_the_outline_by_their_deviation_and_nothing_else():
     mask = disc(CAMERA, 0.3)
     model = MaskErrors(grow=(0, 0), waves=2.0, missed=0)
-    wrong, distance = [], distance_transform_edt(mask) + distance_transform_edt(~mask)
+    wrong = []
+    distance = np.asarray(distance_transform_edt(mask)) + np.asarray(distance_transform_edt(~mask))
     for seed in range(20):
         found = wrong_mask(mask, CAMERA, np.random.default_rng(seed), model)
         assert found[distance > 12].tolist() == mask[distance > 12].tolist()

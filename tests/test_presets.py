@@ -101,5 +101,6 @@ def test_redraw_rule_of_op_align():
     assert presets.least_points("op-align", "isolated", 2, 1024) == (151, 51)
     assert presets.least_points("op-align", "isolated", 3, 1024) == (151, 51, 0)
     assert presets.least_points("op-align", "isolated", 2, 512) == (76, 26)
-    for name, protocol in (("op-align", "full"), ("eap", "isolated"), ("sim-art", "joint")):
-        assert presets.least_points(name, protocol, 2, 1024) == (0, 0)
+    assert presets.least_points("op-align", "full", 2, 1024) == (0, 0)
+    assert presets.least_points("eap", "isolated", 2, 1024) == (0, 0)
+    assert presets.least_points("sim-art", "joint", 2, 1024) == (0, 0)
