@@ -53,7 +53,7 @@ class Rectify(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, d: Tensor) -> Tensor:  # noqa: ANN401
-        """x and direction d, (..., 3, C)."""
+        """Inputs (..., 3, C): vectors and their directions."""
         inverse = ((d * d).sum(-2, keepdim=True) + 1e-6).reciprocal_()
         share = (x * d).sum(-2, keepdim=True).clamp_(max=0).mul_(inverse)
         ctx.save_for_backward(x, d, share, inverse)
@@ -77,7 +77,7 @@ class ScaleToUnit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ANN401
-        """x (..., 3, C); the mean square is (C,)."""
+        """Input (..., 3, C); the mean square is (C,)."""
         rows = x.flatten(0, -2)
         mean_square = 3 * (rows * rows).mean(0)
         scale = (mean_square + TINY).rsqrt()
