@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -28,6 +28,7 @@ SHARD_SAMPLES = 64
 Row = dict[str, np.ndarray]
 
 
+@runtime_checkable
 class CloudReader(Protocol):
     """A module of `sim_assets.sources` that reads clouds."""
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from scapo.urdf import write_urdf
 from sim_assets.import_clouds import CloudReader, SplitWriter, import_split
@@ -30,6 +30,7 @@ SetName = Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "p
 Progress = Callable[[str, int, int], None]
 
 
+@runtime_checkable
 class ModelReader(Protocol):
     """A module of `sim_assets.sources` that reads models."""
 

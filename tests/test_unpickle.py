@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from sim_assets.pickled import MAX_DEPTH
 from sim_assets.unpickle import UnpickleError, unpickle
+from tests.foreign import Calls
 
 PROTOCOLS = range(pickle.HIGHEST_PROTOCOL + 1)
 
@@ -100,16 +101,6 @@ def test_python_2_arrays():
         + b"q\rtq\x0eb."
     )
     assert unpickle(data, "old").tolist() == [1, -2, 3]
-
-
-class Calls:
-    """Pickles as a call of any function."""
-
-    def __init__(self, function: Any, *arguments: object) -> None:
-        self.call = (function, arguments)
-
-    def __reduce__(self) -> Any:
-        return self.call
 
 
 class Later:
