@@ -17,6 +17,8 @@ from scapo.files import Header
 from scapo.layout import StoreError
 from scapo.method import AbstractMethod
 from scapo.model import Scapo, ScapoConfig, cpu_config
+from scapo.registered import RegisteredScapo
+from scapo.registered import cpu_config as cpu_registered
 from scapo.types import Category
 
 
@@ -41,6 +43,7 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "scapo": Method(build=Scapo, presets={"paper": ScapoConfig(), "cpu": cpu_config()}),
+    "registered": Method(build=RegisteredScapo, presets={"cpu": cpu_registered()}),
     "icp": Method(build=Icp, presets={"paper": IcpConfig()}),
 }
 

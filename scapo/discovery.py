@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: MIT
+"""From bare views to an articulated template, without labels and without a network.
+
+Pairwise registrations of a few views vote for one frame; what moves in it gives candidate joints;
+each start is optimised and the one with the least loss goes on; then rounds of search (every view
+over rotations and states) and joint fit on the views that are trusted, a larger share each round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from scapo.axis_search import JointGuess, Posed, principal_frame, search_joint, still_evidence
+from scapo.consensus import agree
+from scapo.joint_fit import FitOptions, fit
+from scapo.part_evidence import farthest_features, rebuild
+from scapo.pose_search import Found, SearchSpace, search
+from scapo.registration import register_pairs, rotation_grid
+from scapo.sightings import Views
+from scapo.template import ArticulatedTemplate, Placement
+from scapo.types import JointKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoveryConfig:
+    """How much is tried; times are seconds on one CPU core per view or pair."""
+
+    seeds: int = 72
+    """Views registered with one another, 10 ms a pair."""
+    rotations: int = 1000
+    """Of the grid that registration and search try."""
+    searched: int = 144
+    """Views of the rounds of search and fit, 0.2 s each and round."""
+    trusted: tuple[float, ...] = (0.4, 0.55, 0.7, 0.85)
+    """Share of the searched views that each round keeps."""
+    starts: int = 2
+    """Candidate axes of each joint that are optimised."""
+    template_points: int = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trusted:
+    """Views and their placements on a template."""
+
+    views: Views
+    placement: Placement
+
+    def cameras(self) -> Float[Tensor, "B 3"]:
+        """Directions to the cameras in the template frame."""
+        direction = self.views.direction()[:, :, None]
+        return (self.placement.rotation.mT @ direction)[..., 0]
+
+
+def common_frame(views: Views, config: DiscoveryConfig) -> Posed:
+    """The half of the views that agree best, in one frame along the object's main directions."""
+    count = len(views.points)
+    pairs = torch.combinations(torch.arange(count)).flip(-1)
+    rotations = rotation_grid(config.rotations)
+    modes = register_pairs(views, pairs, rotations=rotations)
+    consensus = agree(count, pairs, modes)
+    kept = consensus.confidence.topk((count + 1) // 2).indices
+    views = views.take(kept)
+    rotation, translation = consensus.rotation[kept], consensus.translation[kept]
+    normals = views.normals[:, ::4] @ rotation.mT
+    frame = principal_frame(normals.flatten(0, 1), rotation_grid(1500))
+    rotation, translation = frame @ rotation, translation @ frame.T
+    points = views.points @ rotation.mT + translation[:, None]
+    translation = translation - points.flatten(0, 1).median(0).values
+    back = rotation.mT
+    return Posed(views=views, rotation=back, translation=-(back @ translation[..., None])[..., 0])
+
+
+def moved_sets(posed: Posed, joints: int, generator: torch.Generator) -> list[Bool[Tensor, "B K"]]:
+    """For each joint, the points of every view that other views do not confirm where they are.
+
+    Several joints share them by distance to as many centres (k-means in the common frame).
+    """
+    evidence = still_evidence(posed)
+    moved = evidence < evidence.flatten().quantile(0.3)
+    if joints == 1:
+        return [moved]
+    points, _ = posed.world(moved.shape[1])
+    cloud = points[moved]
+    centres = cloud[torch.randperm(len(cloud), generator=generator)[:joints]]
+    for _ in range(20):
+        nearest = torch.cdist(cloud, centres).argmin(-1)
+        means = [cloud[nearest == k].mean(0) for k in range(joints)]
+        centres = torch.where(torch.stack(means).isnan(), centres, torch.stack(means))
+    label = torch.cdist(points.flatten(0, 1), centres).argmin(-1).view(moved.shape)
+    return [moved & (label == k) for k in range(joints)]
+
+
+def candidate_axes(kind: JointKind) -> Float[Tensor, "A 3"]:
+    """The main directions; for slides, also those halfway between two."""
+    axes = torch.eye(3)
+    if kind == "revolute":
+        return axes
+    halfway = [[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]
+    return torch.cat([axes, F.normalize(torch.tensor(halfway, dtype=torch.float32), dim=-1)])
+
+
+def wide_states(kinds: tuple[JointKind, ...], count: int = 13) -> Float[Tensor, "J {count}"]:
+    """All that a joint could do, before anything is known."""
+    ends = [1.7 if kind == "revolute" else 0.5 for kind in kinds]
+    return torch.stack([torch.linspace(-end, end, count) for end in ends])
+
+
+def seen_states(state: Float[Tensor, "B J"], count: int) -> Float[Tensor, "J {count}"]:
+    """The range of trusted states and a third beyond it on both sides."""
+    low, high = state.quantile(0.03, 0), state.quantile(0.97, 0)
+    room = 0.35 * (high - low).clamp_min(0.2)
+    ends = zip((low - room).tolist(), (high + room).tolist(), strict=True)
+    return torch.stack([torch.linspace(a, b, count) for a, b in ends])
+
+
+def first_template(
+    posed: Posed,
+    moved: list[Bool[Tensor, "B K"]],
+    guesses: tuple[JointGuess, ...],
+    kinds: tuple[JointKind, ...],
+    count: int,
+) -> ArticulatedTemplate:
+    """Still points as base and moved points as parts, the guessed joints between them."""
+    points, normals = (x.flatten(0, 1) for x in posed.world(moved[0].shape[1]))
+    label = torch.zeros_like(moved[0], dtype=torch.long)
+    for j, rows in enumerate(moved):
+        label[rows] = j + 1
+    part = F.one_hot(label.flatten(), len(kinds) + 1).to(points)
+    index = farthest_features(torch.cat([points, 0.06 * normals, 0.1 * part], -1)[::2], count) * 2
+    template = ArticulatedTemplate(kinds, count)
+    template.assign(points[index], normals[index], 3 * part[index])
+    with torch.no_grad():
+        template.axis.copy_(torch.stack([guess.axis for guess in guesses]))
+        template.pivot.copy_(torch.stack([guess.pivot for guess in guesses]))
+    return template
+
+
+def best_start(
+    posed: Posed, kinds: tuple[JointKind, ...], config: DiscoveryConfig, generator: torch.Generator
+) -> tuple[ArticulatedTemplate, Trusted]:
+    """The start whose short optimisation leaves the least loss."""
+    moved = moved_sets(posed, len(kinds), generator)
+    guesses = [
+        search_joint(posed, rows, kind, candidate_axes(kind), generator=generator)
+        for rows, kind in zip(moved, kinds, strict=True)
+    ]
+    none = torch.zeros(len(posed.rotation), len(kinds))
+    tried: list[tuple[float, ArticulatedTemplate, Placement]] = []
+    for combination in product(*[found[: config.starts] for found in guesses]):
+        template = first_template(posed, moved, combination, kinds, config.template_points)
+        placement = Placement.at(posed.rotation, posed.translation, none)
+        for round_number in range(4):
+            sharpness = (60.0, 200.0) if round_number == 0 else (120.0, 300.0)
+            options = FitOptions(steps=30, sharpness=sharpness, search_states=(0, 15))
+            placement, _ = fit(
+                template,
+                posed.views,
+                placement,
+                options,
+                states=wide_states(kinds),
+                generator=generator,
+            )
+            rebuild(template, posed.views, placement, generator=generator)
+        placement, loss = fit(
+            template, posed.views, placement, FitOptions(steps=20), generator=generator
+        )
+        tried.append((float(loss.mean()), template, placement))
+    _, template, placement = min(tried, key=lambda start: start[0])
+    return template, Trusted(views=posed.views, placement=placement)
+
+
+def trust_order(found: Found) -> Int[Tensor, " B"]:
+    """Views from the most to the least trusted: a clear margin and a small loss."""
+    return (found.margin - 0.5 * found.loss).argsort(descending=True)
+
+
+def improve(
+    template: ArticulatedTemplate, trusted: Trusted, generator: torch.Generator, rounds: int = 4
+) -> Trusted:
+    """Rebuild parts and fit template, joints and placements to the trusted views."""
+    placement, views = trusted.placement, trusted.views
+    states = seen_states(placement.state, 11)
+    for number in range(rounds):
+        rebuild(template, views, placement, generator=generator)
+        search_at = (0,) if number < rounds // 2 else ()
+        options = FitOptions(steps=25, sharpness=(150.0, 400.0), search_states=search_at)
+        placement, _ = fit(template, views, placement, options, states=states, generator=generator)
+    return Trusted(views=views, placement=placement)
+
+
+def search_all(
+    template: ArticulatedTemplate,
+    views: Views,
+    trusted: Trusted,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> Found:
+    """Every view over rotations and states, near the cameras that trusted views have."""
+    joints = len(template.kinds)
+    space = SearchSpace(
+        states=seen_states(trusted.placement.state, 7 if joints == 1 else 4),
+        rotations=rotation_grid(config.rotations),
+        cameras=trusted.cameras(),
+    )
+    return search(template, views, space, generator=generator)
+
+
+def discover(
+    views: Views, kinds: tuple[JointKind, ...], config: DiscoveryConfig, generator: torch.Generator
+) -> tuple[ArticulatedTemplate, Trusted]:
+    """The articulated template of views of one category, with the views it was fitted to."""
+    seeds = evenly(len(views.points), config.seeds)
+    posed = common_frame(views.take(seeds), config)
+    template, trusted = best_start(posed, kinds, config, generator)
+    searched = views.take(evenly(len(views.points), config.searched))
+    for share in config.trusted:
+        found = search_all(template, searched, trusted, config, generator)
+        kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
+        trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
+        trusted = improve(template, trusted, generator)
+    return template, trusted
+
+
+def evenly(total: int, count: int) -> Int[Tensor, " K"]:
+    """Indices spread over the whole, all where there are no more than `count`."""
+    if total <= count:
+        return torch.arange(total)
+    return torch.linspace(0, total - 1, count).long()

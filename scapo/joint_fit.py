@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""One optimisation of template, parts, joints and all placements against the views.
+
+The loss of a view: every observed point must lie on the placed template with the same normal
+(robust, so that details missing from the template cost a bounded amount), and every template
+point that this camera would have seen must have been seen. Template points that something hides
+or that face away cost nothing. States are searched over a grid now and then, so that a view does
+not stay in a wrong one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import roma
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from scapo.points import gather
+from scapo.registration import NORMAL_WEIGHT
+from scapo.sightings import Views, free_and_hidden
+from scapo.template import ArticulatedTemplate, Placement
+
+NORMAL_LENGTH = 0.06
+"""A unit of normal difference counts as this length when neighbours are sought."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitOptions:
+    """Of one call of `fit`."""
+
+    steps: int = 40
+    sharpness: tuple[float, float] = (120.0, 300.0)
+    """Of the robust distance, per squared normalised length, at the beginning and the end."""
+    points: int = 128
+    """Of each view, drawn anew every step."""
+    shared: bool = True
+    """Whether template and joints move, or the placements alone."""
+    rate: float = 1.0
+    backward: float = 1.0
+    """Weight of what the camera should have seen."""
+    search_states: tuple[int, ...] = ()
+    """Steps at which every state is searched over `states`."""
+    scale_weight: float = 0.05
+    shift_weight: float = 0.5
+
+
+@torch.no_grad()
+def oriented_nearest(
+    points: Float[Tensor, "B K 3"],
+    normals: Float[Tensor, "B K 3"],
+    target: Float[Tensor, "B M 3"],
+    target_normals: Float[Tensor, "B M 3"],
+) -> Int[Tensor, "B K"]:
+    """Nearest target in position and normal: the two faces of a thin plate are told apart."""
+    source = torch.cat([points, NORMAL_LENGTH * normals], -1)
+    goal = torch.cat([target, NORMAL_LENGTH * target_normals], -1)
+    return (goal.square().sum(-1)[:, None] - 2 * source @ goal.mT).argmin(-1)
+
+
+def view_loss(
+    views: Views,
+    placed: tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]],
+    sharpness: float,
+    backward: float = 1.0,
+) -> Float[Tensor, " B"]:
+    """Robust distance of each view to a placed template, both ways, self-occlusion respected.
+
+    Args:
+        views: B views.
+        placed: Points and normals of the template in each view.
+        sharpness: k in 1 - exp(-k d^2).
+        backward: Weight of the template's visible points.
+    """
+    points, normals = placed
+    index = oriented_nearest(views.points, views.normals, points, normals)
+    off = (views.points - gather(points, index)).square().sum(-1)
+    cosine = (views.normals * gather(normals, index)).sum(-1)
+    there = 1 - torch.exp(-sharpness * off - NORMAL_WEIGHT * (1 - cosine))
+    with torch.no_grad():
+        free, hidden = free_and_hidden(views, points, 0.03)
+        ray = F.normalize(views.camera[:, None] - points, dim=-1)
+        faces = (normals * ray).sum(-1) > 0.1
+        counts = (free | (faces & ~hidden)).to(points.dtype)
+        back = oriented_nearest(points, normals, views.points, views.normals)
+    off = (points - gather(views.points, back)).square().sum(-1)
+    return there.mean(-1) + backward * ((1 - torch.exp(-sharpness * off)) * counts).mean(-1)
+
+
+def thin(views: Views, index: Int[Tensor, " K"]) -> Views:
+    """The views with these points only."""
+    return replace(views, points=views.points[:, index], normals=views.normals[:, index])
+
+
+@torch.no_grad()
+def search_states(
+    template: ArticulatedTemplate,
+    views: Views,
+    placement: Placement,
+    states: Float[Tensor, "J S"],
+    sharpness: float,
+) -> Placement:
+    """Each joint's best state of a grid, the others held, the present state among them."""
+    for j in range(states.shape[0]):
+        here = placement.state[:, j : j + 1]
+        tried = torch.cat([here, states[j].to(here).expand(len(here), -1)], 1)
+        loss = []
+        for column in tried.T:
+            state = placement.state.clone()
+            state[:, j] = column
+            placed = template.place(replace(placement, state=state))
+            loss.append(view_loss(views, placed, sharpness))
+        state = placement.state.clone()
+        state[:, j] = tried.gather(1, torch.stack(loss, 1).argmin(1, keepdim=True))[:, 0]
+        placement = replace(placement, state=state)
+    return placement
+
+
+class _Free:
+    """The placement's variables while it is optimised: the rotation as a turn of the start."""
+
+    def __init__(self, start: Placement, template: ArticulatedTemplate, rate: float) -> None:
+        self.start = start
+        self.turn = torch.zeros_like(start.translation).requires_grad_()
+        self.translation = start.translation.detach().clone().requires_grad_()
+        self.log_scale = start.log_scale.detach().clone().requires_grad_()
+        self.state = start.state.detach().clone().requires_grad_()
+        self.shift = start.shift.detach().clone().requires_grad_()
+        slides = torch.tensor([kind == "prismatic" for kind in template.kinds])
+        self.slides = slides.to(start.shift)[:, None]
+        state_rate = 0.01 if bool(slides.all()) else 0.03
+        rates = (
+            (self.turn, 0.02),
+            (self.translation, 0.004),
+            (self.log_scale, 0.008),
+            (self.state, state_rate),
+            (self.shift, 0.006),
+        )
+        self.groups = [{"params": [p], "lr": lr * rate} for p, lr in rates]
+
+    def placement(self, axis: Float[Tensor, "J 3"]) -> Placement:
+        along = (self.shift * axis).sum(-1, keepdim=True) * axis
+        return Placement(
+            rotation=roma.rotvec_to_rotmat(self.turn) @ self.start.rotation,
+            translation=self.translation,
+            log_scale=self.log_scale,
+            state=self.state,
+            shift=(self.shift - along) * self.slides,
+        )
+
+
+def fit(
+    template: ArticulatedTemplate,
+    views: Views,
+    start: Placement,
+    options: FitOptions,
+    *,
+    states: Float[Tensor, "J S"] | None = None,
+    generator: torch.Generator,
+) -> tuple[Placement, Float[Tensor, " B"]]:
+    """Improve the placements of all views, and the template with them if `options.shared`.
+
+    Returns:
+        The placements and the loss of each view at the last step.
+    """
+    free = _Free(start, template, options.rate)
+    groups = [*free.groups, *(_shared_groups(template, options.rate) if options.shared else [])]
+    optimiser = torch.optim.Adam(groups, betas=(0.8, 0.95))
+    rates = [group["lr"] for group in groups]
+    loss = start.translation.new_zeros(len(start.translation))
+    for step in range(options.steps):
+        done = step / max(options.steps - 1, 1)
+        low, high = options.sharpness
+        sharpness = low * (high / low) ** done
+        for group, rate in zip(optimiser.param_groups, rates, strict=True):
+            group["lr"] = rate * min(1.0, max(0.1, (1 - done) / 0.4))
+        index = torch.randperm(views.points.shape[1], generator=generator, device=generator.device)
+        some = thin(views, index[: options.points])
+        if states is not None and step in options.search_states:
+            found = search_states(
+                template, some, free.placement(template.directions()), states, sharpness
+            )
+            free.state.data.copy_(found.state)
+        placement = free.placement(template.directions())
+        loss = view_loss(some, template.place(placement), sharpness, options.backward)
+        total = loss.mean() + _gauge(template, placement, options)
+        optimiser.zero_grad()
+        total.backward()
+        optimiser.step()
+    with torch.no_grad():
+        placement = free.placement(template.directions())
+    return placement.detach(), loss.detach()
+
+
+def _shared_groups(template: ArticulatedTemplate, rate: float) -> list[dict[str, object]]:
+    rates = (
+        (template.points, 0.002),
+        (template.logit, 0.06),
+        (template.axis, 0.05),
+        (template.pivot, 0.012),
+    )
+    return [{"params": [p], "lr": lr * rate} for p, lr in rates]
+
+
+def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOptions) -> Tensor:
+    """What the views leave open: mean scale and state near zero, no part without points."""
+    scale = placement.log_scale
+    gauge = options.scale_weight * scale.square().sum(-1).mean()
+    gauge = gauge + 0.5 * scale.mean(0).square().sum()
+    gauge = gauge + 0.02 * placement.state.mean(0).square().sum()
+    gauge = gauge + options.shift_weight * placement.shift.square().sum((1, 2)).mean()
+    mass = template.logit.softmax(-1).mean(0)
+    return gauge + 10 * (0.06 - mass).clamp_min(0).sum()

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""A placement of the template as a prediction in metres and the camera frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from scapo.geometry import rigid
+from scapo.points import Similarity
+from scapo.template import ArticulatedTemplate, Placement
+from scapo.types import Joints, Prediction
+
+
+def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:
+    """1 for each prismatic joint, 0 for the others."""
+    sliding = [[float(kind == "prismatic")] for kind in template.kinds]
+    return torch.tensor(sliding).to(template.points)
+
+
+def base_centre(template: ArticulatedTemplate) -> Float[Tensor, " 3"]:
+    """Middle of the box of the base's points (2 to 98 %), unscaled: the origin of part frames."""
+    base = template.points[template.logit.argmax(-1) == 0]
+    base = base if len(base) else template.points
+    return base.quantile(torch.tensor([0.02, 0.98]).to(base), 0).mean(0)
+
+
+@torch.no_grad()
+def placed_prediction(
+    template: ArticulatedTemplate,
+    placement: Placement,
+    part_weight: Float[Tensor, "B N P"],
+    similarity: Similarity,
+    confidence: Float[Tensor, " B"],
+) -> Prediction:
+    """The prediction that a placement in normalised frames stands for.
+
+    Args:
+        template: The category's.
+        placement: Of each cloud.
+        part_weight: Of the points.
+        similarity: The normalisation to undo.
+        confidence: Handed on.
+    """
+    poses = template.part_poses(placement)
+    origin = base_centre(template) * placement.log_scale.exp()
+    move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
+    pivot, axis = template.joints_in_view(placement)
+    metric = placement.state / similarity.scale[:, None]
+    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state)
+    return Prediction(
+        part_weight=part_weight,
+        camera_T_part=similarity.inverse_pose(rigid(poses.rotation, move)),
+        joints=Joints(pivot=similarity.inverse(pivot), axis=axis, state=state),
+        canonical_points=canonical_points(template, placement) / similarity.scale[:, None, None],
+        confidence=confidence,
+    )
+
+
+@torch.no_grad()
+def canonical_points(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B M 3"]:
+    """The template in each cloud's size and the template's own state and frame."""
+    still = replace(
+        placement,
+        rotation=torch.eye(3).to(placement.rotation).expand_as(placement.rotation),
+        translation=torch.zeros_like(placement.translation),
+        state=torch.zeros_like(placement.state),
+    )
+    return template.place(still)[0]

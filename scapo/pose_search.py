@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: MIT
+"""Every view against the articulated template: a grid of rotations and states, then refinement.
+
+Cameras that the trusted placements used (as directions in the template frame) bound the search:
+a prior on viewing directions that is learned without labels. The best distinct hypotheses are
+refined all together; what tells them apart is the same loss that the joint fit minimises.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from scapo.joint_fit import FitOptions, fit, thin, view_loss
+from scapo.registration import NORMAL_WEIGHT, NearestGrid, distinct, within
+from scapo.sightings import Views, free_and_hidden
+from scapo.template import ArticulatedTemplate, Placement
+
+CHUNK = 512
+"""Hypotheses refined at once."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchSpace:
+    """What is tried for each view."""
+
+    states: Float[Tensor, "J S"]
+    rotations: Float[Tensor, "H 3 3"]
+    """template_R_view"""
+    cameras: Float[Tensor, "V 3"] | None
+    """Directions in the template frame near which cameras are sought, None for anywhere."""
+    keep: int = 12
+    """Hypotheses of each view that are refined."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """The best placement of each view, and how far to trust it."""
+
+    placement: Placement
+    loss: Float[Tensor, " B"]
+    margin: Float[Tensor, " B"]
+    """Loss of the best placement turned by more than 30 degrees, minus `loss`."""
+
+
+def state_grid(states: Float[Tensor, "J S"]) -> Float[Tensor, "C J"]:
+    """All combinations of the joints' states."""
+    return torch.tensor(list(product(*states.tolist())))
+
+
+@torch.no_grad()
+def coarse_cost(
+    view: Views,
+    states: tuple[Float[Tensor, "S M 3"], Float[Tensor, "S M 3"], NearestGrid],
+    rotation: Float[Tensor, "H 3 3"],
+    count: int = 48,
+) -> tuple[Float[Tensor, "S H"], Float[Tensor, "S H 3"]]:
+    """Cost of one view (B = 1) under rotations template_R_view and every posed template.
+
+    The translation puts the view's centroid on that of the template points facing the camera.
+
+    Returns:
+        Costs, and translations template_T_view.
+    """
+    points, normals, grid = states
+    facing = torch.einsum("smc,hc->shm", normals, rotation @ view.direction()[0]).clamp_min(0)
+    move = torch.einsum("shm,smc->shc", facing, points)
+    move = move / facing.sum(-1, keepdim=True).clamp_min(1e-6)
+    turned = (view.points[:, :count] @ rotation.mT)[None]
+    turned_normals = (view.normals[:, :count] @ rotation.mT)[None].expand(len(points), -1, -1, -1)
+    sets = torch.arange(len(points))
+    match = turned.new_zeros(())
+    for sharpness in (20.0, 60.0, 140.0):
+        placed = turned + move[:, :, None]
+        near, near_normal = (
+            x.unflatten(1, placed.shape[1:3]) for x in grid.lookup(sets, placed.flatten(1, 2))
+        )
+        cosine = (turned_normals * near_normal).sum(-1)
+        gap = near - placed
+        match = torch.exp(-sharpness * gap.square().sum(-1) - NORMAL_WEIGHT * (1 - cosine))
+        if sharpness < 140:  # slide to where the matched points lie
+            total = match.sum(-1, keepdim=True).clamp_min(1e-6)
+            move = move + (match[..., None] * gap).sum(-2) / total
+    cost = 1 - match.mean(-1)
+    some = points[:, None, :: max(1, points.shape[1] // 64)]
+    back = (some - move[:, :, None]) @ rotation
+    free, _ = free_and_hidden(view, back.flatten(0, 2)[None], 0.04)
+    return cost + 0.5 * free.view(back.shape[:3]).float().mean(-1), move
+
+
+@torch.no_grad()
+def propose(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Placement:
+    """The `space.keep` best distinct placements of each view on the grid, view by view."""
+    states = state_grid(space.states)
+    turn = torch.eye(3).expand(len(states), 3, 3)
+    posed = template.place(Placement.at(turn, torch.zeros(len(states), 3), states))
+    grid = NearestGrid.build(*posed)
+    found = []
+    for b in range(len(views.points)):
+        view = views.take(torch.tensor([b]))
+        tried = space.rotations
+        if space.cameras is not None:
+            near = (tried @ view.direction()[0] @ space.cameras.mT).amax(-1)
+            tried = tried[near.topk(max(space.keep * 8, int((near > 0.3).sum()))).indices]
+        cost, move = coarse_cost(view, (*posed, grid), tried)
+        least, state = cost.min(0)
+        best = distinct(tried[None], least[None], space.keep, 25.0)[0]
+        rotation = tried[best].mT
+        shift = -(rotation @ move[state[best], best, :, None])[..., 0]
+        found.append(Placement.at(rotation, shift, states[state[best]]))
+    return Placement.cat(found)
+
+
+def refine(
+    template: ArticulatedTemplate,
+    views: Views,
+    start: Placement,
+    *,
+    generator: torch.Generator,
+    steps: int = 25,
+    points: int = 96,
+) -> tuple[Placement, Float[Tensor, " H"]]:
+    """Improve hypotheses (as many as views) and give the loss of each."""
+    placements, losses = [], []
+    for index in torch.arange(len(views.points)).split(CHUNK):
+        part = views.take(index)
+        options = FitOptions(steps=steps, sharpness=(80.0, 250.0), points=points, shared=False)
+        placement, _ = fit(template, part, start.take(index), options, generator=generator)
+        with torch.no_grad():
+            some = thin(part, torch.arange(0, part.points.shape[1], 2))
+            loss = view_loss(some, template.place(placement), 250.0, 2.0)
+            loss = loss + 0.05 * placement.log_scale.square().sum(-1)
+        placements.append(placement)
+        losses.append(loss)
+    return Placement.cat(placements), torch.cat(losses)
+
+
+def best_of(placement: Placement, loss: Float[Tensor, " H"], count: int) -> Found:
+    """The best of the hypotheses of each of `count` views, and its margin."""
+    table = loss.view(count, -1)
+    best = table.argmin(1)
+    index = torch.arange(count, device=loss.device) * table.shape[1] + best
+    chosen = placement.take(index)
+    trace = placement.rotation.view(count, -1, 3, 3) * chosen.rotation[:, None]
+    other = torch.where(within(trace.sum((-1, -2)), 30.0), 2.0, table).amin(1)
+    return Found(placement=chosen, loss=loss[index], margin=other - loss[index])
+
+
+def search(
+    template: ArticulatedTemplate,
+    views: Views,
+    space: SearchSpace,
+    *,
+    generator: torch.Generator,
+) -> Found:
+    """The best placement of every view over all rotations and states."""
+    start = propose(template, views, space)
+    keep = space.keep
+    count, survivors = len(views.points), max(2, keep // 3)
+    index = torch.arange(count).repeat_interleave(keep)
+    quick, loss = refine(
+        template, views.take(index), start, generator=generator, steps=10, points=64
+    )
+    order = distinct(
+        quick.rotation.unflatten(0, (count, keep)), loss.view(count, keep), survivors, 15.0
+    )
+    chosen = (order + torch.arange(count)[:, None] * keep).flatten()
+    index = torch.arange(count).repeat_interleave(survivors)
+    placement, loss = refine(template, views.take(index), quick.take(chosen), generator=generator)
+    return best_of(placement, loss, count)

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: MIT
+"""The placements that search found for the training clouds, as the network's targets."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from scapo.template import Placement
+
+
+class PseudoPlacements(nn.Module):
+    """Placements of training clouds as found, looked up by a cloud's first point."""
+
+    key: Tensor
+    rotation: Tensor
+    translation: Tensor
+    log_scale: Tensor
+    state: Tensor
+    shift: Tensor
+    camera: Tensor
+    """Centres in the template frame."""
+    trust: Tensor
+    """Weight of each when the network learns."""
+    NAMES: ClassVar[tuple[str, ...]] = (
+        "key",
+        "rotation",
+        "translation",
+        "log_scale",
+        "state",
+        "shift",
+        "camera",
+        "trust",
+    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in self.NAMES:
+            self.register_buffer(name, torch.zeros(0))
+
+    def set(self, key: Tensor, placement: Placement, camera: Tensor, trust: Tensor) -> None:
+        """Replace all."""
+        values = (
+            key,
+            placement.rotation,
+            placement.translation,
+            placement.log_scale,
+            placement.state,
+            placement.shift,
+            camera,
+            trust,
+        )
+        for name, value in zip(self.NAMES, values, strict=True):
+            setattr(self, name, value.detach().clone())
+
+    def placement(self) -> Placement:
+        """All of them."""
+        names = self.NAMES[1:6]
+        return Placement(**{name: getattr(self, name) for name in names})
+
+    def find(self, first: Float[Tensor, "B 3"]) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
+        """Row of each cloud, and whether it is there."""
+        gap = (first[:, None] - self.key).abs().sum(-1)
+        return gap.argmin(1), gap.amin(1) == 0
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        *rest: Any,  # noqa: ANN401 - as torch calls it
+        **named: Any,  # noqa: ANN401
+    ) -> None:
+        """Take the size of what is loaded."""
+        for name in self.NAMES:
+            if prefix + name in state_dict:
+                setattr(self, name, torch.zeros_like(state_dict[prefix + name]))
+        super()._load_from_state_dict(state_dict, prefix, *rest, **named)

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""The shape that registration and joint fit share: an articulated template and its placements.
+
+One template per category: oriented points, part weights, joint axes and pivots, all in a template
+frame at state 0. A placement says where one cloud has it: pose of the base, joint states, three
+scales along the template's axes, and for prismatic joints where on the body the part sits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import roma
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from scapo.types import JointKind
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placement:
+    """Where B views have the template; normalised units and frames of the views."""
+
+    rotation: Float[Tensor, "B 3 3"]
+    """view_R_template of the base."""
+    translation: Float[Tensor, "B 3"]
+    log_scale: Float[Tensor, "B 3"]
+    """Along the template's axes, before everything else."""
+    state: Float[Tensor, "B J"]
+    """Relative to the template's own state: rad or normalised length."""
+    shift: Float[Tensor, "B J 3"]
+    """Of a joint and its part on the base, template frame, after scaling."""
+
+    def take(self, index: Int[Tensor, " Q"]) -> Placement:
+        """The placements of these indices."""
+        return Placement(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def detach(self) -> Placement:
+        """The same values without a graph."""
+        return Placement(**{f.name: getattr(self, f.name).detach() for f in fields(self)})
+
+    @staticmethod
+    def at(
+        rotation: Float[Tensor, "B 3 3"],
+        translation: Float[Tensor, "B 3"],
+        state: Float[Tensor, "B J"],
+    ) -> Placement:
+        """A placement without scaling or shift."""
+        return Placement(
+            rotation=rotation,
+            translation=translation,
+            log_scale=torch.zeros_like(translation),
+            state=state,
+            shift=translation.new_zeros(*state.shape, 3),
+        )
+
+    @staticmethod
+    def cat(parts: list[Placement]) -> Placement:
+        """Placements one after the other."""
+        names = [f.name for f in fields(Placement)]
+        return Placement(**{n: torch.cat([getattr(p, n) for p in parts]) for n in names})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PartPoses:
+    """view_T_part of B views and P parts, acting on scaled template points."""
+
+    rotation: Float[Tensor, "B P 3 3"]
+    translation: Float[Tensor, "B P 3"]
+
+
+class ArticulatedTemplate(nn.Module):
+    """Oriented points with part weights, and the joints that move them."""
+
+    points: nn.Parameter
+    """(M, 3)"""
+    logit: nn.Parameter
+    """(M, P) part weights before the softmax."""
+    axis: nn.Parameter
+    """(J, 3), any length."""
+    pivot: nn.Parameter
+    """(J, 3)"""
+    normals: Tensor
+    """(M, 3), a buffer."""
+
+    def __init__(self, kinds: tuple[JointKind, ...], count: int = 400) -> None:
+        """A template of `count` points at the origin, to be filled by `assign`."""
+        super().__init__()
+        self.kinds = kinds
+        self.points = nn.Parameter(torch.zeros(count, 3))
+        self.logit = nn.Parameter(torch.zeros(count, len(kinds) + 1))
+        self.axis = nn.Parameter(torch.ones(len(kinds), 3))
+        self.pivot = nn.Parameter(torch.zeros(len(kinds), 3))
+        self.register_buffer("normals", torch.zeros(count, 3))
+
+    @torch.no_grad()
+    def assign(
+        self,
+        points: Float[Tensor, "M 3"],
+        normals: Float[Tensor, "M 3"],
+        logit: Float[Tensor, "M P"],
+    ) -> None:
+        """Replace the shape and its parts, keep the joints. Fewer points are repeated."""
+        index = torch.arange(len(self.points)) % len(points)
+        self.points.copy_(points[index])
+        self.normals.copy_(normals[index])
+        self.logit.copy_(logit[index])
+
+    def directions(self) -> Float[Tensor, "J 3"]:
+        """Unit axes."""
+        return F.normalize(self.axis, dim=-1)
+
+    def part_poses(self, placement: Placement) -> PartPoses:
+        """view_T_part of every part at the placement's states (corrected bone map of Sec. 3.2)."""
+        rotations, translations = [placement.rotation], [placement.translation]
+        axis = self.directions()
+        pivot = self.pivot * placement.log_scale.exp()[:, None]
+        for j, kind in enumerate(self.kinds):
+            step = axis[j] * placement.state[:, j : j + 1]
+            if kind == "revolute":
+                turn = roma.rotvec_to_rotmat(step)
+                move = pivot[:, j] - (turn @ pivot[:, j, :, None])[..., 0]
+            else:
+                turn, move = torch.eye(3).to(step).expand(len(step), 3, 3), step
+            move = move + placement.shift[:, j]
+            rotations.append(placement.rotation @ turn)
+            moved = (placement.rotation @ move[..., None])[..., 0]
+            translations.append(moved + placement.translation)
+        return PartPoses(
+            rotation=torch.stack(rotations, 1), translation=torch.stack(translations, 1)
+        )
+
+    def place(self, placement: Placement) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]]:
+        """Points and unit normals of the template in every view, parts blended by weight."""
+        poses, weight = self.part_poses(placement), self.logit.softmax(-1)
+        scaled = self.points * placement.log_scale.exp()[:, None]
+        points, normals = torch.zeros_like(scaled), torch.zeros_like(scaled)
+        for p in range(weight.shape[1]):
+            turn = poses.rotation[:, p].mT
+            share = weight[:, p : p + 1]
+            points = points + share * (scaled @ turn + poses.translation[:, p, None])
+            normals = normals + share * (self.normals @ turn)
+        return points, F.normalize(normals, dim=-1)
+
+    def joints_in_view(
+        self, placement: Placement
+    ) -> tuple[Float[Tensor, "B J 3"], Float[Tensor, "B J 3"]]:
+        """Pivots and axes in the frame of every view."""
+        pivot = self.pivot * placement.log_scale.exp()[:, None] + placement.shift
+        pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
+        return pivot, self.directions() @ placement.rotation.mT

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""Predictions from placements: metres, the camera frame, one joint motion between the parts."""
+
+from __future__ import annotations
+
+import torch
+from sighted import template
+from strategies import generator
+from torch.testing import assert_close
+
+from scapo.geometry import apply, invert, joint_motion, random_rotations
+from scapo.placed import base_centre, canonical_points, placed_prediction, slides
+from scapo.points import normalise
+from scapo.template import ArticulatedTemplate, Placement
+
+
+@torch.no_grad()
+def test_parts_and_joint_of_a_prediction_belong_together():
+    cloud = torch.randn(3, 50, 3, generator=generator(0)) + torch.tensor([0, 0, 4.0])
+    _, similarity = normalise(cloud)
+    rotation = random_rotations(3, generator(1))
+    state = torch.tensor([[0.2], [0.7], [1.1]])
+    placement = Placement.at(rotation, 0.1 * torch.randn(3, 3, generator=generator(2)), state)
+    shape = template()
+    weight = torch.full((3, 50, 2), 0.5)
+    found = placed_prediction(shape, placement, weight, similarity, torch.ones(3))
+    assert found.camera_T_part is not None
+    assert found.joints is not None
+    base, lid = found.camera_T_part.unbind(1)
+    motion = joint_motion(
+        found.joints.pivot[:, 0], found.joints.axis[:, 0], state[:, 0], "revolute"
+    )
+    assert_close(lid, motion @ base, atol=1e-4, rtol=0)
+    centre = apply(base, base_centre(shape).expand(3, 1, 3) * 0)
+    expected = similarity.inverse(
+        (rotation @ base_centre(shape))[:, None] + placement.translation[:, None]
+    )
+    assert_close(centre, expected, atol=1e-5, rtol=1e-5)
+    assert_close(invert(base) @ base, torch.eye(4).expand(3, 4, 4), atol=1e-5, rtol=0)
+    still = canonical_points(shape, placement)
+    assert_close(still[0], still[2], atol=1e-6, rtol=0)
+
+
+def test_slides_are_marked():
+    shape = ArticulatedTemplate(("revolute", "prismatic"), 5)
+    assert slides(shape).tolist() == [[0.0], [1.0]]

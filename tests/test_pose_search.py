@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""Search over rotations and states finds known placements; the margin tells the sure ones."""
+
+from __future__ import annotations
+
+import torch
+from sighted import sighted, template
+from strategies import generator
+
+from scapo.geometry import rotation_angle
+from scapo.pose_search import SearchSpace, best_of, search, state_grid
+from scapo.registration import rotation_grid
+from scapo.template import Placement
+
+
+def test_known_placements_are_found():
+    views, truth = sighted(4, seed=40)
+    space = SearchSpace(
+        states=torch.linspace(0, 1, 4)[None], rotations=rotation_grid(700), cameras=None, keep=8
+    )
+    found = search(template(), views, space, generator=generator(0))
+    errors = rotation_angle(found.placement.rotation, truth.rotation).rad2deg()
+    assert errors.median() < 8
+    assert (errors < 15).sum() >= 3
+    assert bool((found.margin >= 0).all())
+    state = (found.placement.state - truth.state).abs()[errors < 15]
+    assert state.max() < 0.2
+
+
+def test_all_combinations_of_states():
+    grid = state_grid(torch.tensor([[0.0, 1], [2, 3]]))
+    assert grid.tolist() == [[0, 2], [0, 3], [1, 2], [1, 3]]
+
+
+def test_the_best_and_its_margin():
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    rotation = torch.stack([torch.eye(3), turn, torch.eye(3), turn, turn, torch.eye(3)])
+    start = Placement.at(rotation, torch.zeros(6, 3), torch.arange(6.0)[:, None])
+    found = best_of(start, torch.tensor([0.3, 0.2, 0.5, 0.1, 0.15, 0.4]), 2)
+    assert found.placement.state[:, 0].tolist() == [1, 3]
+    assert torch.allclose(found.margin, torch.tensor([0.1, 0.3]))

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: MIT
+"""Stored placements: found by a cloud's first point, saved and loaded with their size."""
+
+from __future__ import annotations
+
+import torch
+from strategies import generator
+from torch.testing import assert_close
+
+from scapo.geometry import random_rotations
+from scapo.pseudo_placements import PseudoPlacements
+from scapo.template import Placement
+
+
+def test_clouds_are_found_and_strangers_are_not():
+    g = generator(0)
+    key = torch.randn(6, 3, generator=g)
+    placement = Placement.at(random_rotations(6, g), key, torch.arange(6.0)[:, None])
+    stored = PseudoPlacements()
+    stored.set(key, placement, torch.randn(6, 3, generator=g), torch.ones(6))
+    row, there = stored.find(torch.cat([key[[4, 1]], torch.randn(1, 3, generator=g)]))
+    assert row[:2].tolist() == [4, 1]
+    assert there.tolist() == [True, True, False]
+    loaded = PseudoPlacements()
+    loaded.load_state_dict(stored.state_dict())
+    assert_close(loaded.placement().state, placement.state)
+    assert_close(loaded.camera, stored.camera)

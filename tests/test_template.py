@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""The template's motions against the library's joint motion, for both kinds of joint."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from strategies import generator
+from torch.testing import assert_close
+
+from scapo.geometry import apply, joint_motion, random_rotations, rigid
+from scapo.template import ArticulatedTemplate, Placement
+from scapo.types import JointKind
+
+
+def drawn(kind: JointKind) -> tuple[ArticulatedTemplate, Placement]:
+    """A template and a placement with everything drawn."""
+    g = generator(6)
+    template = ArticulatedTemplate((kind,), 20)
+    points, normals = torch.randn(2, 20, 3, generator=g)
+    part = torch.nn.functional.one_hot(torch.arange(20) % 2, 2)
+    template.assign(points, torch.nn.functional.normalize(normals, dim=-1), 60.0 * part)
+    with torch.no_grad():
+        template.axis.copy_(torch.randn(1, 3, generator=g))
+        template.pivot.copy_(torch.randn(1, 3, generator=g))
+    return template, Placement(
+        rotation=random_rotations(4, g),
+        translation=torch.randn(4, 3, generator=g),
+        log_scale=0.2 * torch.randn(4, 3, generator=g),
+        state=torch.randn(4, 1, generator=g),
+        shift=torch.randn(4, 1, 3, generator=g),
+    )
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@torch.no_grad()
+def test_parts_move_as_their_joint_says(kind: JointKind):
+    template, placement = drawn(kind)
+    points, normals = template.place(placement)
+    scaled = template.points * placement.log_scale.exp()[:, None]
+    axis = template.directions().expand(4, 3)
+    pivot = template.pivot * placement.log_scale.exp()
+    motion = joint_motion(pivot, axis, placement.state[:, 0], kind)
+    motion[:, :3, 3] += placement.shift[:, 0]
+    view_T_base = rigid(placement.rotation, placement.translation)
+    assert_close(points[:, ::2], apply(view_T_base, scaled[:, ::2]))
+    assert_close(points[:, 1::2], apply(view_T_base @ motion, scaled[:, 1::2]))
+    assert_close(normals.norm(dim=-1), torch.ones(4, 20))
+    seen, direction = template.joints_in_view(placement)
+    assert_close(seen, apply(view_T_base, (pivot + placement.shift[:, 0])[:, None]))
+    assert_close(direction[:, 0], (placement.rotation @ axis[..., None])[..., 0])
+
+
+def test_placements_are_taken_and_joined():
+    _, placement = drawn("revolute")
+    back = Placement.cat([placement.take(torch.tensor([2, 3])), placement.take(torch.tensor([0]))])
+    assert_close(back.state, placement.state[[2, 3, 0]])
+    assert_close(back.shift, placement.shift[[2, 3, 0]])
