@@ -41,7 +41,7 @@ def test_smoothing_keeps_a_constant():
 def test_the_template_is_rebuilt_from_the_views():
     views, truth = sighted(12, seed=22)
     shape = template()
-    shape.points += 0.05 * torch.randn(400, 3, generator=generator(1))
+    shape.points.data += 0.05 * torch.randn(400, 3, generator=generator(1))
     shape.logit.zero_()
     rebuild(shape, views, truth, generator=generator(2))
     good = template(seed=5, count=3000)

@@ -61,7 +61,7 @@ def test_losses_are_zero_where_votes_are_right_and_distrust_counts_nothing():
         assert terms[name] == 0
     votes.points.retain_grad()
     (votes.points * 0 + (votes.points - torch.randn(2, 64, 3, generator=g)) ** 2).sum()
-    sum(terms.values()).backward()
+    torch.stack(list(terms.values())).sum().backward()
     assert votes.points.grad is None or votes.points.grad[1].abs().max() == 0
 
 
