@@ -13,7 +13,7 @@ from tiny import TINY, tiny
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
-from scapo.geometry import apply, invert, is_rotation
+from scapo.geometry import apply, invert, is_rotation, joint_motion
 from scapo.method import Step
 from scapo.model import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
 from scapo.types import Labels, Observation, Prediction
@@ -21,7 +21,7 @@ from scapo.types import Labels, Observation, Prediction
 STAGES = (CANONICALISE, ARTICULATE)
 
 
-def trained(steps: int = 15, category: str = "laptop") -> Scapo:
+def trained(steps: int = 8, category: str = "laptop") -> Scapo:
     """A model whose batch statistics have seen some clouds."""
     model = tiny(category=category)
     observation, _ = plates(16, 96)
@@ -36,11 +36,6 @@ def trained(steps: int = 15, category: str = "laptop") -> Scapo:
             torch.stack(list(model.losses(observation, Labels(), step).values())).sum().backward()
             optimizer.step()
     return model.eval()
-
-
-@pytest.fixture(scope="module")
-def model() -> Scapo:
-    return trained()
 
 
 def predict(model: Scapo, points: torch.Tensor) -> Prediction:
@@ -77,10 +72,8 @@ def test_stages_freeze_the_encoder_for_half_of_the_second() -> None:
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-8), (torch.float32, 1e-3)])
-def test_predictions_move_with_the_camera(
-    model: Scapo, dtype: torch.dtype, tolerance: float
-) -> None:
-    model = trained(0).to(dtype) if dtype == torch.float64 else model
+def test_predictions_move_with_the_camera(dtype: torch.dtype, tolerance: float) -> None:
+    model = tiny().to(dtype).eval()
     model.load_state_dict(trained_state())
     points = plates(12, 96, seed=5)[0].points.to(dtype)
     motion = rigid_motions(3, 12, dtype=dtype)
@@ -107,26 +100,29 @@ def trained_state() -> dict[str, torch.Tensor]:
     return _STATE
 
 
-def test_predictions_scale_with_the_cloud(model: Scapo) -> None:
-    points = plates(4, 96, seed=5)[0].points
-    before, after = predict(model, points), predict(model, 3 * points)
+def test_predictions_scale_with_the_cloud() -> None:
+    model = tiny().double()
+    model.load_state_dict(trained_state())
+    points = plates(4, 96, seed=5)[0].points.double()
+    before, after = predict(model.eval(), points), predict(model, 3 * points)
     assert before.joints is not None
     assert after.joints is not None
     assert before.canonical_points is not None
-    assert_close(after.part_weight, before.part_weight, atol=1e-4, rtol=0)
-    assert_close(after.joints.pivot, 3 * before.joints.pivot, atol=1e-3, rtol=0)
-    assert_close(after.joints.state, before.joints.state, atol=1e-3, rtol=0)
-    assert_close(after.canonical_points, 3 * before.canonical_points, atol=1e-3, rtol=0)
+    close = {"atol": 1e-8, "rtol": 0}
+    assert_close(after.part_weight, before.part_weight, **close)
+    assert_close(after.joints.pivot, 3 * before.joints.pivot, **close)
+    assert_close(after.joints.state, before.joints.state, **close)
+    assert_close(after.canonical_points, 3 * before.canonical_points, **close)
 
 
 def test_a_prismatic_state_is_in_metres() -> None:
-    model = trained(3, "drawer")
-    points = plates(4, 96, seed=5)[0].points
+    model = trained(3, "drawer").double()
+    points = plates(4, 96, seed=5)[0].points.double()
     before, after = predict(model, points), predict(model, 3 * points)
     assert before.joints is not None
     assert after.joints is not None
     assert before.joints.state.abs().max() > 0
-    assert_close(after.joints.state, 3 * before.joints.state, atol=1e-4, rtol=1e-3)
+    assert_close(after.joints.state, 3 * before.joints.state, atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("category", ["laptop", "eyeglasses", "drawer"])
@@ -143,10 +139,10 @@ def test_predictions_are_well_formed(category: str) -> None:
     assert_close(prediction.joints.axis.norm(dim=-1), torch.ones(3, joints))
 
 
-def test_part_poses_differ_by_the_joint_motion(model: Scapo) -> None:
+def test_part_poses_differ_by_the_joint_motion() -> None:
     """The child's pose is the base's followed by the relative state about the predicted axis."""
-    from scapo.geometry import joint_motion
-
+    model = tiny().eval()
+    model.load_state_dict(trained_state())
     points = plates(4, 96, seed=5)[0].points
     prediction = predict(model, points)
     joints, poses = prediction.joints, prediction.camera_T_part
@@ -242,18 +238,18 @@ def test_variants_name_what_differs() -> None:
 
 
 def test_both_stages_learn() -> None:
-    observation, _ = plates(32, 128)
+    observation, _ = plates(16, 96)
     model = tiny()
-    optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
+    optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
     for stage, term in ((CANONICALISE, "rec"), (ARTICULATE, "recon")):
         model.start(stage, observation, Labels(), generator(1))
         model.train()
         history = []
-        for k in range(60):
+        for k in range(30):
             step = Step(stage=stage, progress=0.1, generator=generator(k))
             terms = model.losses(observation, Labels(), step)
             optimizer.zero_grad()
             torch.stack(list(terms.values())).sum().backward()
             optimizer.step()
             history.append(terms[term].item())
-        assert sum(history[-5:]) < 0.7 * sum(history[:5]), stage
+        assert sum(history[-3:]) < 0.7 * sum(history[:3]), stage

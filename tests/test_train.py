@@ -174,7 +174,7 @@ def test_a_checkpoint_of_no_known_method_is_refused(run: Path, tmp_path: Path) -
     arrays, header = read(run / "checkpoint.safetensors")
     path = tmp_path / "c.safetensors"
     write(path, arrays, {**header, "method": "magic"})
-    with pytest.raises(StoreError, match="expected a method of scapo, icp, found 'magic'"):
+    with pytest.raises(StoreError, match=r"expected a method of scapo, .*icp.*, found 'magic'"):
         load(path)
 
 
