@@ -8,6 +8,7 @@ its part's pose lies on that part's surface to a few micrometres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -141,6 +142,17 @@ def _pick(
     return np.stack(images)[source, pixel]
 
 
+@lru_cache(maxsize=4)
+def pixel_rays(camera: Intrinsics) -> Float[np.ndarray, "K 3"]:
+    """Rays through the centres of all pixels, row by row, with z = 1; not to be written to."""
+    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    x, y = np.meshgrid(u, v)
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    rays.setflags(write=False)
+    return rays
+
+
 def _back_project(
     frames: list[Frame],
     source: Int[np.ndarray, " N"],
@@ -148,10 +160,7 @@ def _back_project(
     camera: Intrinsics,
 ) -> Float[np.ndarray, "N 3"]:
     z = _pick([frame.depth.ravel() for frame in frames], source, pixel).astype(np.float64)
-    v, u = np.divmod(pixel, camera.width)
-    x = (u + 0.5 - camera.cx) / camera.fx * z
-    y = (v + 0.5 - camera.cy) / camera.fy * z
-    return np.stack([x, y, z], -1)
+    return pixel_rays(camera)[pixel] * z[:, None]
 
 
 class Surface:
@@ -167,6 +176,7 @@ class Surface:
         self.normals = np.stack(
             [mesh.face_normals[face] for mesh, (_, face) in zip(self.meshes, drawn, strict=True)]
         )
+        self._both = np.concatenate([self.points, self.normals], 1)
         self.colors = [face_colors(visuals) for visuals in thing.visuals]
         self.areas = np.array([mesh.area for mesh in self.meshes])
         self.tolerance = TOLERANCE * float(np.linalg.norm(thing.extents()))
@@ -188,10 +198,9 @@ class Surface:
             camera: Intrinsics.
             camera_T_part: Poses.
         """
-        turn = camera_T_part[:, :3, :3].transpose(0, 2, 1)
-        points = self.points @ turn + camera_T_part[:, None, :3, 3]
-        nx, ny, nz = np.moveaxis(self.normals @ turn, -1, 0)
-        x, y, z = np.moveaxis(points, -1, 0)
+        turned = (self._both @ camera_T_part[:, :3, :3].transpose(0, 2, 1)).transpose(2, 0, 1)
+        nx, ny, nz = turned[:, :, SURFACE_SAMPLES:]
+        x, y, z = turned[:, :, :SURFACE_SAMPLES] + camera_T_part[:, :3, 3].T[:, :, None]
         ahead = np.maximum(z, 1e-9)
         u = np.floor(x / ahead * camera.fx + camera.cx)
         v = np.floor(y / ahead * camera.fy + camera.cy)

@@ -11,8 +11,8 @@ import numpy as np
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.cloud import Cloud, Surface, sample_frames, truth, visible_pixels
-from sim_assets.noise import Sensor, measure
+from sim_assets.cloud import FPS_POOL, Cloud, Surface, sample_frames, truth, visible_pixels
+from sim_assets.noise import Sensor, measure_some
 from sim_assets.options import Mask, Noise, Preset, Protocol, Sampling
 from sim_assets.preset_views import Wanted, draw_preset_views
 from sim_assets.presets import least_points
@@ -26,6 +26,8 @@ LEAST_PIXELS = 200
 """Visible pixels below which a view is drawn again (CONTRACT 3)."""
 LEAST_POINTS = 16
 """Points of each part below which a view is drawn again (CONTRACT 4)."""
+SENSED = 3
+"""Pixels for which the sensor is simulated, for each that is needed: some measure nothing."""
 MAX_DRAWS = 100
 """Draws of one view after which an object counts as impossible to show."""
 BATCH = 64
@@ -84,6 +86,8 @@ class Shooter:
         self.least = min(LEAST_POINTS, max(1, settings.points // (4 * parts)))
         self.asked = least_points(settings.preset, settings.protocol, parts, settings.points)
         self.sensor = Sensor(noise=settings.noise, mask=settings.mask)
+        pool = FPS_POOL if settings.sampling == "fps" else SENSED
+        self.enough = pool * max(settings.points, LEAST_PIXELS)
         shared = {field.name: getattr(settings, field.name) for field in fields(Wanted)}
         self.wanted = Wanted(**shared)
         if renderer is not None:
@@ -96,21 +100,23 @@ class Shooter:
             ViewError: No draw of a view was good.
         """
         for start in range(0, len(keys), BATCH):
-            batch = keys[start : start + BATCH]
-            rngs = [generator(*key, 0) for key in batch]
-            views = draw_preset_views(self.outline, rngs, self.wanted)
-            for key, rng, view in zip(batch, rngs, views, strict=True):
-                yield self._shoot(key, rng, view)
+            yield from self._shoot(keys[start : start + BATCH])
 
-    def _shoot(self, key: tuple[object, ...], rng: np.random.Generator, view: View) -> Shot:
-        plan = _plan_bytes(view)
+    def _shoot(self, keys: Sequence[tuple[object, ...]]) -> list[Shot]:
+        """Draw all, then again those that are poor, until none is."""
+        shots: dict[int, Shot] = {}
+        plans: list[bytes] = []
         for draws in range(1, MAX_DRAWS + 1):
-            if draws > 1:
-                rng = generator(*key, draws - 1)
-                (view,) = draw_preset_views(self.outline, [rng], self.wanted)
-            rows = self._rows(view, rng)
-            if rows is not None:
-                return Shot(rows=rows, draws=draws, plan=plan)
+            poor = [k for k in range(len(keys)) if k not in shots]
+            rngs = [generator(*keys[k], draws - 1) for k in poor]
+            views = draw_preset_views(self.outline, rngs, self.wanted)
+            plans = plans or [_plan_bytes(view) for view in views]
+            for k, rng, view in zip(poor, rngs, views, strict=True):
+                rows = self._rows(view, rng)
+                if rows is not None:
+                    shots[k] = Shot(rows=rows, draws=draws, plan=plans[k])
+            if len(shots) == len(keys):
+                return [shots[k] for k in range(len(keys))]
         raise ViewError(
             f"{self.thing.instance}: expected a view with {LEAST_PIXELS} visible pixels and "
             f"{self.least} of {self.settings.points} points on each part, found none in "
@@ -137,7 +143,7 @@ class Shooter:
             )
         else:
             frames = self._frames(self.renderer, state, view)
-            sensed = [measure(frame, settings.camera, rng, self.sensor) for frame in frames]
+            sensed = measure_some(frames, settings.camera, rng, self.sensor, self.enough)
             seen = visible_pixels(sensed)
             if sum(len(pixels) for pixels in seen) < LEAST_PIXELS:
                 return None

@@ -8,6 +8,7 @@ front faces, so surfaces that are not closed are drawn twice, once reversed.
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -84,8 +85,11 @@ class SapienRenderer(AbstractRenderer):
         self.stage: _Stage | None = None
 
     def open(self, thing: ArticulatedObject) -> None:
-        """A new scene for each object: one whose objects are exchanged grows in memory."""
-        self.close()
+        """A new scene for each object: one whose objects are exchanged grows in memory.
+
+        The old scene goes only when the new one is there, since SAPIEN makes what scenes share
+        anew, in 20 ms, when there was none left.
+        """
         self.stage = _Stage(self.device, thing, self.color)
 
     def render(
@@ -142,13 +146,13 @@ class _Stage:
     def aim(self, camera_T_object: Float[np.ndarray, "4 4"], camera: Intrinsics) -> None:
         if self.size != (camera.width, camera.height):
             self._make_camera(camera)
-        object_T_camera = np.linalg.inv(camera_T_object)
+        turn, shift = camera_T_object[:3, :3].T, camera_T_object[:3, 3]
         object_T_robot = np.eye(4)
-        object_T_robot[:3, :3] = object_T_camera[:3, :3] @ CAMERA_T_ROBOT
-        object_T_robot[:3, 3] = object_T_camera[:3, 3]
+        object_T_robot[:3, :3] = turn @ CAMERA_T_ROBOT
+        object_T_robot[:3, 3] = -turn @ shift
         self.eye.set_pose(sapien.Pose(object_T_robot))
         # A tight depth range keeps surfaces a fraction of a millimetre apart in order.
-        distance = float(np.linalg.norm(camera_T_object[:3, 3]))
+        distance = math.hypot(*shift)
         near = max(distance - 1.1 * self.reach, 0.02 * distance, 1e-4)
         far = distance + 1.1 * self.reach
         self.camera.set_perspective_parameters(

@@ -21,6 +21,9 @@ from sim_assets.renderer import AbstractRenderer, Backend, make_renderer
 from sim_assets.request import versions
 from sim_assets.samples import Row, Shooter, Shot, geometry_digest
 
+REPORT_EVERY = 8
+"""Views."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShardJob:
@@ -124,10 +127,12 @@ def render_piece(request: Request, piece: Piece, report: Report) -> tuple[list[S
     settings = request.settings
     shooter = Shooter(_renderer(settings.backend, settings.color), thing, settings)
     keys = [request.key(view) for view in range(piece.first, piece.first + piece.views)]
-    shots = []
+    shots, told = [], 0
     for shot in shooter.shots(keys):
         shots.append(shot)
-        report(name, settings.states_per_view)
+        if len(shots) - told >= REPORT_EVERY or len(shots) == piece.views:
+            report(name, (len(shots) - told) * settings.states_per_view)
+            told = len(shots)
     index = np.array(piece.index, np.int32)
     return shots, [{**row, "instance": index} for shot in shots for row in shot.rows]
 

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Labelled clouds per second against a bare SAPIEN loop, and memory: `make bench`.
+
+The loops run in a process of their own, without the test run's checks of shapes.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from sim_assets.options import DataOptions
+from sim_assets.renderer import RenderError, resolve_backend
+from sim_assets.request import make_request
+from sim_assets.stream import _samples
+
+SHARE = 0.8
+"""Of the bare loop's rate that ours must reach."""
+MEMORY_MB = 40
+"""By which the process may grow over the later objects."""
+
+
+@pytest.fixture(autouse=True)
+def device() -> None:
+    try:
+        resolve_backend("sapien")
+    except RenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize("category", ["drawer", "oven", "eyeglasses"])
+def test_clouds_against_a_bare_loop(category: str, benchmark: BenchmarkFixture) -> None:
+    command = [sys.executable, "-W", "ignore", str(Path(__file__).with_name("clouds.py")), category]
+    found: list[dict[str, float]] = []
+
+    def once() -> None:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        found.append(json.loads(done.stdout.splitlines()[-1]))
+
+    benchmark.pedantic(once, rounds=1)
+    info: dict[str, Any] = benchmark.extra_info
+    info.update({name: round(value, 3) for name, value in found[0].items()})
+    print(  # noqa: T201
+        f"\n{category}: {found[0]['clouds']:.0f} clouds/s, bare loop {found[0]['bare']:.0f}/s, "
+        f"ratio {found[0]['ratio']:.2f}"
+    )
+    assert found[0]["ratio"] >= SHARE
+
+
+def test_memory_stays_flat() -> None:
+    status = Path("/proc/self/status")
+    if not status.exists():
+        pytest.skip("no /proc to read the size of the process from")
+    options = DataOptions(count=80 * 10, instances=80, backend="sapien", points=256)
+    request, assets = make_request("oven", options)
+    sizes = []
+    for number, _ in enumerate(_samples(request, assets)):
+        if number in (300, 799):
+            line = next(x for x in status.read_text().splitlines() if x.startswith("VmRSS"))
+            sizes.append(int(line.split()[1]) / 1024)
+    print(f"\n{sizes[0]:.0f} MB after 30 objects, {sizes[1]:.0f} MB after 80")  # noqa: T201
+    assert sizes[1] - sizes[0] < MEMORY_MB
