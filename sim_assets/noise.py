@@ -9,18 +9,19 @@ sensor measured there, 255 where it is none.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from scapo.camera import Intrinsics
 from sim_assets.noise_disparity import PUBLISHED as DISPARITY
-from sim_assets.noise_disparity import Disparity, disparity
+from sim_assets.noise_disparity import Disparity, disparity_at
 from sim_assets.noise_edges import CHOSEN as EDGES
 from sim_assets.noise_edges import Edges, flying_pixels, holes
 from sim_assets.noise_kinect import PUBLISHED as KINECT
-from sim_assets.noise_kinect import Kinect, kinect
+from sim_assets.noise_kinect import Kinect, kinect_at
 from sim_assets.noise_mask import CHOSEN as MASK
 from sim_assets.noise_mask import MaskErrors, wrong_mask
 from sim_assets.noise_scene import BESIDE, Clutter, put_behind, put_beside
@@ -51,7 +52,27 @@ class Sensor:
     errors: MaskErrors = MASK
 
 
-def measure(frame: Frame, camera: Intrinsics, rng: np.random.Generator, sensor: Sensor) -> Frame:
+def measure_some(
+    frames: list[Frame], camera: Intrinsics, rng: np.random.Generator, sensor: Sensor, enough: int
+) -> list[Frame]:
+    """All pictures of a sample by `measure`, with about `enough` pixels of all of them simulated.
+
+    The same share of each, so that parts rendered alone keep their proportion.
+    """
+    if sensor.noise == "none" and sensor.mask == "exact":
+        return frames
+    pixels = sum(int(np.count_nonzero(frame.part != BACKGROUND)) for frame in frames)
+    share = min(1.0, enough / max(pixels, 1))
+    return [measure(frame, camera, rng, sensor, share) for frame in frames]
+
+
+def measure(
+    frame: Frame,
+    camera: Intrinsics,
+    rng: np.random.Generator,
+    sensor: Sensor,
+    share: float = 1.0,
+) -> Frame:
     """The picture as the sensor and its mask give it.
 
     Args:
@@ -59,12 +80,14 @@ def measure(frame: Frame, camera: Intrinsics, rng: np.random.Generator, sensor: 
         camera: Intrinsics.
         rng: Of this picture.
         sensor: What is simulated.
+        share: Of the mask's pixels that are simulated, drawn at random: a cloud of few points
+            needs no more, and is drawn from these as it would be from all.
 
     Returns:
-        Depth 0 outside the mask and where nothing was measured; part 255 there and where
-        something else than the object was measured.
+        Depth 0 outside the mask and where nothing was measured or simulated; part 255 there and
+        where something else than the object was measured.
     """
-    depth, part = corrupt(frame.depth, frame.part, camera, rng, sensor)
+    depth, part = corrupt(frame.depth, frame.part, camera, rng, sensor, share)
     color = frame.color
     if color is not None:
         foreign = (part == BACKGROUND) & (depth > 0)
@@ -73,7 +96,12 @@ def measure(frame: Frame, camera: Intrinsics, rng: np.random.Generator, sensor: 
 
 
 def corrupt(
-    depth: Depth, part: Parts, camera: Intrinsics, rng: np.random.Generator, sensor: Sensor
+    depth: Depth,
+    part: Parts,
+    camera: Intrinsics,
+    rng: np.random.Generator,
+    sensor: Sensor,
+    share: float = 1.0,
 ) -> tuple[Depth, Parts]:
     """See `measure`; pictures that do not show the object stay as they are."""
     if sensor.noise == "none" and sensor.mask == "exact":
@@ -89,32 +117,49 @@ def corrupt(
         width=columns.stop - columns.start,
         height=rows.stop - rows.start,
     )
+    clean, label = np.ascontiguousarray(depth[window], np.float32), part[window].copy()
+    scene, mask = _surroundings(clean, label, cropped, rng, sensor)
+    at = np.flatnonzero(mask)
+    if share < 1:
+        at = np.sort(rng.choice(at, math.ceil(share * len(at)), replace=False, shuffle=False))
+    measured, label = _sense(scene, label, cropped, rng, sensor, at)
     made_depth, made_part = np.zeros_like(depth), np.full_like(part, BACKGROUND)
-    made_depth[window], made_part[window] = _corrupt(
-        depth[window].astype(np.float32), part[window], cropped, rng, sensor
-    )
+    place = (rows.start + at // cropped.width, columns.start + at % cropped.width)
+    made_depth[place], made_part[place] = measured, label
     return made_depth, made_part
 
 
-def _corrupt(
+def _surroundings(
     depth: Depth, part: Parts, camera: Intrinsics, rng: np.random.Generator, sensor: Sensor
-) -> tuple[Depth, Parts]:
+) -> tuple[Depth, Bool[np.ndarray, "H W"]]:
+    """The object's picture with a scene around it, and which pixels are taken for the object."""
     seen = part != BACKGROUND
     scene = put_behind(depth, camera, rng)
-    mask = seen
-    if sensor.mask == "imperfect":
-        scene, beside = put_beside(scene, seen, rng, sensor.clutter)
-        mask = wrong_mask(seen, camera, rng, sensor.errors) | beside
-    measured, label = scene, part
+    if sensor.mask == "exact":
+        return scene, seen
+    scene, beside = put_beside(scene, seen, rng, sensor.clutter)
+    return scene, wrong_mask(seen, camera, rng, sensor.errors) | beside
+
+
+def _sense(
+    scene: Depth,
+    part: Parts,
+    camera: Intrinsics,
+    rng: np.random.Generator,
+    sensor: Sensor,
+    at: Int[np.ndarray, " K"],
+) -> tuple[Float[np.ndarray, " K"], UInt8[np.ndarray, " K"]]:
+    """Depth and part measured at these pixels; 0 and 255 where there is nothing to keep."""
+    measured, label = scene.take(at), part.take(at)
     if sensor.noise != "none":
-        shown = surface(scene)
+        shown = surface(scene, at)
         if sensor.noise == "kinect":
-            measured, label = kinect(scene, part, camera, rng, sensor.kinect, shown)
+            measured, label = kinect_at(scene, part, camera, rng, shown, sensor.kinect)
         else:
-            measured, label = disparity(scene, part, camera, rng, sensor.disparity)
+            measured, label = disparity_at(scene, part, camera, rng, at, sensor.disparity)
         measured = flying_pixels(measured, shown, rng, sensor.edges)
         measured = np.where(holes(shown, camera, rng, sensor.edges), 0, measured)
-    kept = mask & (measured > 0)
+    kept = measured > 0
     if sensor.mask == "exact":
         kept &= label != BACKGROUND
     return np.where(kept, measured, 0), np.where(kept, label, np.uint8(BACKGROUND))

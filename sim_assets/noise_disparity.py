@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from scapo.camera import Intrinsics
 
@@ -64,7 +64,20 @@ def disparity(
     rng: np.random.Generator,
     model: Disparity = PUBLISHED,
 ) -> tuple[Float[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
-    """Depth and part that the sensor measures at each pixel.
+    """Depth and part that the sensor measures at each pixel; see `disparity_at`."""
+    measured, label = disparity_at(depth, part, camera, rng, np.arange(depth.size), model)
+    return measured.reshape(depth.shape), label.reshape(depth.shape)
+
+
+def disparity_at(
+    depth: Float[np.ndarray, "H W"],
+    part: UInt8[np.ndarray, "H W"],
+    camera: Intrinsics,
+    rng: np.random.Generator,
+    at: Int[np.ndarray, " K"],
+    model: Disparity = PUBLISHED,
+) -> tuple[Float[np.ndarray, " K"], UInt8[np.ndarray, " K"]]:
+    """Depth and part that the sensor measures at some pixels.
 
     Depth between pixels is interpolated, so pixels beside a depth edge measure what is between the
     two surfaces.
@@ -74,50 +87,40 @@ def disparity(
         part: Part index; 255 for what is no part.
         camera: Intrinsics of this image.
         rng: Three numbers are drawn for each pixel.
+        at: Flat indices of the pixels.
         model: Coefficients.
 
     Returns:
         Depth with noise, 0 where there is nothing, and the part nearest to where it was measured.
     """
-    right = rng.standard_normal(depth.shape, np.float32)
-    down = rng.standard_normal(depth.shape, np.float32)
-    u = _shifted(np.arange(depth.shape[1], dtype=np.float32)[None], right, camera.fx, model)
-    v = _shifted(np.arange(depth.shape[0], dtype=np.float32)[:, None], down, camera.fy, model)
-    shifted, seen = _interpolate(depth, part, u, v) if model.shift else (depth, part)
-    disturbance = np.float32(model.sigma) * rng.standard_normal(depth.shape, np.float32)
+    right, down, disturbance = rng.standard_normal((3, len(at)), np.float32)
+    v, u = np.divmod(at, camera.width)
+    u = np.clip(u + np.float32(model.shift * camera.fx / FOCAL) * right, 0, camera.width - 1)
+    v = np.clip(v + np.float32(model.shift * camera.fy / FOCAL) * down, 0, camera.height - 1)
+    shifted, seen = _interpolate(depth, part, u.astype(np.float32), v.astype(np.float32))
     if not (model.sigma or model.rounded):
         return shifted, seen
     there = shifted > 0
-    steps = np.divide(model.scale, shifted, out=np.zeros_like(shifted), where=there) + disturbance
+    steps = np.divide(model.scale, shifted, out=np.zeros_like(shifted), where=there)
+    steps += np.float32(model.sigma) * disturbance
     steps = np.rint(steps) if model.rounded else steps
     there &= steps > 0
     noisy = np.divide(model.scale, steps, out=np.zeros_like(shifted), where=there)
     return noisy, np.where(there, seen, np.uint8(255))
 
 
-def _shifted(
-    place: Float[np.ndarray, "_ _"],
-    normal: Float[np.ndarray, "H W"],
-    focal: float,
-    model: Disparity,
-) -> Float[np.ndarray, "H W"]:
-    """Where each pixel is measured along one axis, inside the image."""
-    last = np.float32(place.size - 1)
-    return np.clip(place + np.float32(model.shift * focal / FOCAL) * normal, 0, last)
-
-
 def _interpolate(
     depth: Float[np.ndarray, "H W"],
     part: UInt8[np.ndarray, "H W"],
-    u: Float[np.ndarray, "H W"],
-    v: Float[np.ndarray, "H W"],
-) -> tuple[Float[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
+    u: Float[np.ndarray, " K"],
+    v: Float[np.ndarray, " K"],
+) -> tuple[Float[np.ndarray, " K"], UInt8[np.ndarray, " K"]]:
     """Bilinear depth and nearest part; nearest depth where one of the four pixels has none."""
     height, width = depth.shape
-    left = np.minimum(np.floor(u), np.float32(max(width - 2, 0)))
-    top = np.minimum(np.floor(v), np.float32(max(height - 2, 0)))
-    a, b = u - left, v - top
-    first = (top * width + left).astype(np.intp)
+    left = np.minimum(u.astype(np.intp), max(width - 2, 0))
+    top = np.minimum(v.astype(np.intp), max(height - 2, 0))
+    a, b = (u - left).astype(np.float32), (v - top).astype(np.float32)
+    first = top * width + left
     next_u, next_v = min(width - 1, 1), width * min(height - 1, 1)
     corners = [depth.take(first + step) for step in (0, next_u, next_v, next_u + next_v)]
     above = corners[0] + a * (corners[1] - corners[0])

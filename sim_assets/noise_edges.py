@@ -32,19 +32,19 @@ CHOSEN = Edges()
 
 
 def flying_pixels(
-    depth: Float[np.ndarray, "H W"],
+    depth: Float[np.ndarray, " K"],
     shown: Surface,
     rng: np.random.Generator,
     model: Edges = CHOSEN,
-) -> Float[np.ndarray, "H W"]:
+) -> Float[np.ndarray, " K"]:
     """Move some pixels beside depth edges to a place between the two surfaces.
 
     The place is uniform in inverse depth, up to the middle; the pixel beyond the edge covers the
     other half.
 
     Args:
-        depth: z as measured elsewhere, m.
-        shown: The surface without noise.
+        depth: z as measured at some pixels, m.
+        shown: The surface there without noise.
         rng: Two numbers are drawn for each pixel.
         model: Shares.
     """
@@ -60,7 +60,7 @@ def holes(
     camera: Intrinsics,
     rng: np.random.Generator,
     model: Edges = CHOSEN,
-) -> Bool[np.ndarray, "H W"]:
+) -> Bool[np.ndarray, " K"]:
     """Pixels that measure nothing, beside depth edges and on surfaces seen at a grazing angle.
 
     Args:

@@ -78,44 +78,55 @@ def kinect(
     camera: Intrinsics,
     rng: np.random.Generator,
     model: Kinect = PUBLISHED,
-    shown: Surface | None = None,
 ) -> tuple[Float[np.ndarray, "H W"], UInt8[np.ndarray, "H W"]]:
-    """Depth and part of the surface that a Kinect measures at each pixel.
+    """Depth and part of the surface that a Kinect measures at each pixel; see `kinect_at`."""
+    shown = surface(depth)
+    measured, label = kinect_at(depth, part, camera, rng, shown, model)
+    return measured.reshape(depth.shape), label.reshape(depth.shape)
+
+
+def kinect_at(
+    depth: Float[np.ndarray, "H W"],
+    part: UInt8[np.ndarray, "H W"],
+    camera: Intrinsics,
+    rng: np.random.Generator,
+    shown: Surface,
+    model: Kinect = PUBLISHED,
+) -> tuple[Float[np.ndarray, " K"], UInt8[np.ndarray, " K"]]:
+    """Depth and part of the surface that a Kinect measures at some pixels.
 
     Args:
         depth: z, m; 0 where there is nothing.
         part: Part index; 255 for what is no part.
         camera: Intrinsics of this image.
         rng: Three numbers are drawn for each pixel.
+        shown: The surface at these pixels.
         model: Coefficients.
-        shown: `surface(depth)`, where it is known already.
 
     Returns:
         Depth with noise, 0 where there is nothing, and the part whose surface was measured.
     """
-    shown = shown or surface(depth)
-    theta = incidence(shown, camera)
-    look, du, dv = _look(theta, camera, rng, model)
-    q = shown.inverse.take(look)
-    moved = q - du * shown.slope_u.take(look) - dv * shown.slope_v.take(look)
-    moved = np.clip(moved, q / 2, q * 2)
-    here = look == np.arange(look.size).reshape(look.shape)
+    look, du, dv = _look(shown, camera, rng, model)
+    there = surface(depth, look)
+    q = there.inverse
+    moved = np.clip(q - du * there.slope_u - dv * there.slope_v, q / 2, q * 2)
     clean = np.divide(1, moved, out=np.zeros_like(moved), where=moved > 0)
-    clean = np.where(here, depth, clean)
-    sigma = axial_sigma(np.maximum(clean, np.float32(0.1)), theta.take(look), model)
-    noisy = clean + sigma * rng.standard_normal(depth.shape, np.float32)
+    clean = np.where(look == shown.at, depth.take(look), clean)
+    sigma = axial_sigma(np.maximum(clean, np.float32(0.1)), incidence(there, camera), model)
+    noisy = clean + sigma * rng.standard_normal(len(look), np.float32)
     measured = (clean > 0) & (noisy > 0)
     return np.where(measured, noisy, 0), np.where(measured, part.take(look), np.uint8(255))
 
 
 def _look(
-    theta: Float[np.ndarray, "H W"], camera: Intrinsics, rng: np.random.Generator, model: Kinect
-) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    shown: Surface, camera: Intrinsics, rng: np.random.Generator, model: Kinect
+) -> tuple[Int[np.ndarray, " K"], Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
     """Flat index of the pixel whose surface each pixel sees, and how far right and down it is."""
-    height, width = theta.shape
-    sigma = lateral_sigma(theta, model)
-    u, v = np.arange(width, dtype=np.float32)[None], np.arange(height, dtype=np.float32)[:, None]
-    right = np.rint(sigma * (camera.fx / FOCAL) * rng.standard_normal(theta.shape, np.float32))
-    down = np.rint(sigma * (camera.fy / FOCAL) * rng.standard_normal(theta.shape, np.float32))
-    seen_u, seen_v = np.clip(u + right, 0, width - 1), np.clip(v + down, 0, height - 1)
-    return (seen_v * width + seen_u).astype(np.intp), seen_u - u, seen_v - v
+    v, u = np.divmod(shown.at, camera.width)
+    sigma = lateral_sigma(incidence(shown, camera), model)
+    right = np.rint(sigma * (camera.fx / FOCAL) * rng.standard_normal(len(u), np.float32))
+    down = np.rint(sigma * (camera.fy / FOCAL) * rng.standard_normal(len(u), np.float32))
+    seen_u = np.clip(u + right.astype(np.intp), 0, camera.width - 1)
+    seen_v = np.clip(v + down.astype(np.intp), 0, camera.height - 1)
+    du, dv = (seen_u - u).astype(np.float32), (seen_v - v).astype(np.float32)
+    return seen_v * camera.width + seen_u, du, dv

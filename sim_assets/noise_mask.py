@@ -7,6 +7,7 @@ focal length of 600 pixels, and scale with the camera's.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,10 +54,7 @@ def wrong_mask(
     pixel = camera.fx / FOCAL
     grow = round(rng.uniform(*model.grow) * pixel)
     made = shrink(mask, -grow) if grow < 0 else grow_mask(mask, grow)
-    du, dv = (
-        model.waves * pixel * _smooth(mask.shape, model.wavelength * pixel, rng) for _ in range(2)
-    )
-    made = _displaced(made, du, dv)
+    made = _wave(made, model.waves * pixel, model.wavelength * pixel, rng)
     return made & ~_piece(mask, rng, model)
 
 
@@ -78,27 +76,53 @@ def shrink(mask: Bool[np.ndarray, "H W"], pixels: int) -> Bool[np.ndarray, "H W"
     return ~grow_mask(~mask, pixels)
 
 
-def _smooth(
-    shape: tuple[int, ...], wavelength: float, rng: np.random.Generator
-) -> Float[np.ndarray, "H W"]:
-    """Standard normal numbers on a coarse grid, interpolated between."""
-    cell = max(wavelength, 2.0)
-    grid = rng.standard_normal([int(size / cell) + 2 for size in shape]).astype(np.float32)
-    for axis, size in enumerate(shape):
-        place = np.arange(size, dtype=np.float32) / np.float32(cell)
-        low = place.astype(np.intp)
-        part = (place - low).reshape([-1 if i == axis else 1 for i in range(2)])
-        grid = grid.take(low, axis) * (1 - part) + grid.take(low + 1, axis) * part
-    return grid
-
-
-def _displaced(
-    mask: Bool[np.ndarray, "H W"], du: Float[np.ndarray, "H W"], dv: Float[np.ndarray, "H W"]
+def _wave(
+    mask: Bool[np.ndarray, "H W"], size: float, length: float, rng: np.random.Generator
 ) -> Bool[np.ndarray, "H W"]:
+    """Take each pixel from a place nearby that changes smoothly, by up to three deviations.
+
+    The displacement is normal on a coarse grid and interpolated between. Only the pixels near the
+    outline can change.
+    """
+    cell = max(length, 2.0)
+    grid = rng.standard_normal((2, *(int(side / cell) + 2 for side in mask.shape)))
+    reach = math.ceil(3 * size)
+    if not reach:
+        return mask
+    near = _square(mask, reach) & _square(~mask, reach)
+    v, u = np.nonzero(near)
+    fields = np.clip(size * grid, -reach, reach)
+    dv, du = (np.rint(_between(field, v / cell, u / cell)).astype(np.intp) for field in fields)
     height, width = mask.shape
-    u = np.clip(np.arange(width)[None] + np.rint(du).astype(np.intp), 0, width - 1)
-    v = np.clip(np.arange(height)[:, None] + np.rint(dv).astype(np.intp), 0, height - 1)
-    return mask.ravel()[v * width + u]
+    made = mask.copy()
+    made[v, u] = mask[np.clip(v + dv, 0, height - 1), np.clip(u + du, 0, width - 1)]
+    return made
+
+
+def _between(
+    grid: Float[np.ndarray, "h w"], v: Float[np.ndarray, " K"], u: Float[np.ndarray, " K"]
+) -> Float[np.ndarray, " K"]:
+    """Bilinear interpolation, element by element: the same on every machine."""
+    i, j = v.astype(np.intp), u.astype(np.intp)
+    a, b = v - i, u - j
+    above = grid[i, j] * (1 - b) + grid[i, j + 1] * b
+    below = grid[i + 1, j] * (1 - b) + grid[i + 1, j + 1] * b
+    return above * (1 - a) + below * a
+
+
+def _square(mask: Bool[np.ndarray, "H W"], reach: int) -> Bool[np.ndarray, "H W"]:
+    """Dilated by a square of side 2 reach + 1, in a logarithmic number of steps."""
+    done = 0
+    while done < reach:
+        step = min(done + 1, reach - done)
+        wider = mask.copy()
+        wider[step:] |= mask[:-step]
+        wider[:-step] |= mask[step:]
+        mask = wider.copy()
+        mask[:, step:] |= wider[:, :-step]
+        mask[:, :-step] |= wider[:, step:]
+        done += step
+    return mask
 
 
 def _piece(

@@ -2,7 +2,8 @@
 """Slope, incidence angle and depth edges of the surface that a depth image shows.
 
 All in inverse depth q = 1/z, which is linear in the pixel coordinates on a plane: slopes and angles
-of flat surfaces are exact, and a plane has no edges, however steep it is.
+of flat surfaces are exact, and a plane has no edges, however steep it is. Everything is computed at
+a list of pixels (`at`, flat indices), as a cloud needs only some of them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from scapo.camera import Intrinsics
 
@@ -21,44 +22,55 @@ It is far above what creases and curved surfaces show from one pixel to the next
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Surface:
-    """What each pixel of a depth image shows of the surface; zeros where nothing was measured."""
+    """What pixels show of the surface; zeros where nothing was measured."""
 
-    inverse: Float[np.ndarray, "H W"]
+    at: Int[np.ndarray, " K"]
+    """Flat indices of the pixels."""
+    inverse: Float[np.ndarray, " K"]
     """q = 1/z, 1/m."""
-    slope_u: Float[np.ndarray, "H W"]
+    slope_u: Float[np.ndarray, " K"]
     """Change of q over one pixel to the right, on the pixel's own surface."""
-    slope_v: Float[np.ndarray, "H W"]
+    slope_v: Float[np.ndarray, " K"]
     """Change of q over one pixel down."""
-    across: Float[np.ndarray, "H W"]
+    across: Float[np.ndarray, " K"]
     """Change of q to the neighbour beyond a depth edge; 0 where there is no edge."""
 
 
-def surface(depth: Float[np.ndarray, "H W"]) -> Surface:
+def surface(depth: Float[np.ndarray, "H W"], at: Int[np.ndarray, " K"] | None = None) -> Surface:
     """Slopes and edges, by differences to the four neighbours.
 
     Of the two differences along a row or column the smaller one is on the pixel's own surface.
 
     Args:
         depth: z in m; 0 where nothing was measured.
+        at: Flat indices of pixels; default: of all.
     """
-    q = np.divide(1, depth, out=np.zeros(depth.shape, np.float32), where=depth > 0)
-    slope_u, jump_u = _differences(q, axis=1)
-    slope_v, jump_v = _differences(q, axis=0)
+    height, width = depth.shape
+    at = np.arange(depth.size) if at is None else at
+    v, u = np.divmod(at, width)
+    q = _inverse(depth, at)
+    ends = (u == width - 1, u == 0, v == height - 1, v == 0)
+    steps = []
+    for move, end in zip((1, -1, width, -width), ends, strict=True):
+        other = _inverse(depth, np.where(end, at, at + move))
+        step = (other - q) * (1 if move > 0 else -1)
+        step[end | (other == 0) | (q == 0)] = np.inf
+        steps.append(step)
+    slope_u, jump_u = _choose(q, steps[0], steps[1])
+    slope_v, jump_v = _choose(q, steps[2], steps[3])
     across = np.where(np.abs(jump_u) >= np.abs(jump_v), jump_u, jump_v)
-    return Surface(inverse=q, slope_u=slope_u, slope_v=slope_v, across=across)
+    return Surface(at=at, inverse=q, slope_u=slope_u, slope_v=slope_v, across=across)
 
 
-def _differences(
-    q: Float[np.ndarray, "H W"], axis: int
-) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """Along an axis: change per pixel on the own surface, and change across an edge or 0."""
-    first: tuple[slice, ...] = (slice(None),) * axis + (slice(None, -1),)
-    last: tuple[slice, ...] = (slice(None),) * axis + (slice(1, None),)
-    step = q[last] - q[first]
-    step[(q[last] == 0) | (q[first] == 0)] = np.inf
-    after, before = np.full(q.shape, np.inf, np.float32), np.full(q.shape, np.inf, np.float32)
-    after[first] = step
-    before[last] = step
+def _inverse(depth: Float[np.ndarray, "H W"], at: Int[np.ndarray, " K"]) -> Float[np.ndarray, " K"]:
+    z = depth.take(at).astype(np.float32, copy=False)
+    return np.divide(1, z, out=np.zeros(z.shape, np.float32), where=z > 0)
+
+
+def _choose(
+    q: Float[np.ndarray, " K"], after: Float[np.ndarray, " K"], before: Float[np.ndarray, " K"]
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """Of the changes per pixel on both sides: the one on the own surface, the one over an edge."""
     size_after, size_before = np.abs(after), np.abs(before)
     own = size_after <= size_before
     slope = np.where(own, after, before)
@@ -69,7 +81,7 @@ def _differences(
     return slope, across
 
 
-def edges(shown: Surface) -> Bool[np.ndarray, "H W"]:
+def edges(shown: Surface) -> Bool[np.ndarray, " K"]:
     """Pixels beside a depth edge."""
     return shown.across != 0
 
@@ -83,7 +95,7 @@ def rays(
     return x[None].astype(np.float32), y[:, None].astype(np.float32)
 
 
-def incidence(shown: Surface, camera: Intrinsics) -> Float[np.ndarray, "H W"]:
+def incidence(shown: Surface, camera: Intrinsics) -> Float[np.ndarray, " K"]:
     """Angle between the surface's normal and the ray to the camera, rad, 0 where head-on.
 
     On the plane n . X = d the inverse depth is q = n . (x, y, 1) / d, so the slopes give n / d, and
@@ -91,10 +103,12 @@ def incidence(shown: Surface, camera: Intrinsics) -> Float[np.ndarray, "H W"]:
 
     Args:
         shown: The surface.
-        camera: Intrinsics of this image.
+        camera: Intrinsics of its image.
     """
     q = shown.inverse
-    x, y = rays((q.shape[0], q.shape[1]), camera)
+    v, u = np.divmod(shown.at, camera.width)
+    x = ((u + (0.5 - camera.cx)) / camera.fx).astype(np.float32)
+    y = ((v + (0.5 - camera.cy)) / camera.fy).astype(np.float32)
     a = shown.slope_u * np.float32(camera.fx)
     b = shown.slope_v * np.float32(camera.fy)
     c = q - x * a - y * b

@@ -67,29 +67,34 @@ def draw_preset_views(
     if rules.published is not None:
         return [_published(outline.thing, rng, wanted) for rng in rngs]
     if rules.distance:
-        return [_at_distance(outline, rng, wanted) for rng in rngs]
+        return _at_distance(outline, rngs, wanted)
     return draw_views(outline, rngs, wanted.camera, wanted.states_per_view)
 
 
-def _at_distance(outline: Outline, rng: np.random.Generator, wanted: Wanted) -> View:
-    """The category's window, at a drawn distance from which the whole object is in the picture.
+def _at_distance(
+    outline: Outline, rngs: Sequence[np.random.Generator], wanted: Wanted
+) -> list[View]:
+    """The category's window, at drawn distances from which the whole object is in the picture.
 
     Where even the largest distance is too near for that, the camera stands there.
     """
-    thing, camera = outline.thing, wanted.camera
-    states = rng.uniform(*TRAVEL, size=(wanted.states_per_view, len(thing.upper))) * thing.upper
-    gaze = -draw_direction(thing.category.window, rng)
-    turn = look_along(gaze, rng.uniform(-np.pi, np.pi))
-    centre = rng.uniform(-1, 1, size=2) * min(JITTER, (1 - FULL_FRAME) / 2)
-    place = rng.uniform()
-    points = outline.posed(states)[None]
-    fill = np.array([FULL_FRAME])
-    pose = frame_objects(points, turn[None], camera, fill, centre[None])[0]
+    thing = outline.thing
+    drawn, turns, centres, places = [], [], [], []
+    for rng in rngs:
+        size = (wanted.states_per_view, len(thing.upper))
+        drawn.append(rng.uniform(*TRAVEL, size=size) * thing.upper)
+        gaze = -draw_direction(thing.category.window, rng)
+        turns.append(look_along(gaze, rng.uniform(-np.pi, np.pi)))
+        centres.append(rng.uniform(-1, 1, size=2) * min(JITTER, (1 - FULL_FRAME) / 2))
+        places.append(rng.uniform())
+    points = np.stack([outline.posed(states) for states in drawn])
+    fill = np.full(len(points), FULL_FRAME)
+    poses = frame_objects(points, np.stack(turns), wanted.camera, fill, np.stack(centres))
+    nearest = np.sqrt((poses[:, :3, 3] ** 2).sum(-1))
     low, high = distances(thing)
-    nearest = float(np.sqrt((pose[:3, 3] ** 2).sum()))
-    low = min(max(low, nearest), high)
-    pose[:3, 3] *= (low + place * (high - low)) / nearest
-    return View(states=states, camera_T_object=pose)
+    low = np.clip(nearest, low, high)
+    poses[:, :3, 3] *= ((low + np.array(places) * (high - low)) / nearest)[:, None]
+    return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
 
 
 def distances(thing: ArticulatedObject) -> tuple[float, float]:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -69,7 +71,7 @@ def test_the_deviation_on_a_plate(z):
 def test_shifts_interpolate_depth_and_take_the_nearest_part():
     depth = np.random.default_rng(0).uniform(1, 2, (40, 50)).astype(np.float32)
     part = np.random.default_rng(1).integers(0, 3, depth.shape).astype(np.uint8)
-    seen_by = camera(50)
+    seen_by = replace(camera(50), height=40)
     model = Disparity(sigma=0, shift=0.7, rounded=False)
     found, label = disparity(depth, part, seen_by, np.random.default_rng(2), model)
     rng = np.random.default_rng(2)

@@ -24,10 +24,11 @@ def test_flying_pixels_lie_on_their_own_half_of_the_gap():
     depth = step()
     shown = surface(depth)
     model = Edges(flying=0.4)
-    found = flying_pixels(depth, shown, np.random.default_rng(0), model)
-    moved = found != depth
+    found = flying_pixels(depth.ravel(), shown, np.random.default_rng(0), model)
+    moved = found != depth.ravel()
     assert not moved[~edges(shown)].any()
     assert moved[edges(shown)].mean() == pytest.approx(0.4, abs=0.08)
+    found, moved = found.reshape(depth.shape), moved.reshape(depth.shape)
     middle = 2 / (1 / 1.0 + 1 / 1.5)
     near, far = found[:, 99][moved[:, 99]], found[:, 100][moved[:, 100]]
     assert 1.0 <= near.min() < near.max() <= middle + 1e-6 <= far.min() + 2e-6
@@ -46,11 +47,12 @@ def test_holes_beside_edges_have_the_given_share():
 )
 def test_holes_at_grazing_angles(degrees, share):
     shown = surface(plate(CAMERA, 1.0, degrees, 0.0))
-    gone = holes(shown, CAMERA, np.random.default_rng(0), Edges(lost=0))[:, 97:103]
-    assert gone.mean() == pytest.approx(share, abs=0.05)
+    gone = holes(shown, CAMERA, np.random.default_rng(0), Edges(lost=0)).reshape(200, 200)
+    assert gone[:, 97:103].mean() == pytest.approx(share, abs=0.05)
 
 
 def test_without_shares_nothing_happens():
     shown = surface(step())
-    assert np.array_equal(flying_pixels(step(), shown, np.random.default_rng(0), QUIET), step())
+    depth = step().ravel()
+    assert np.array_equal(flying_pixels(depth, shown, np.random.default_rng(0), QUIET), depth)
     assert not holes(shown, CAMERA, np.random.default_rng(0), QUIET).any()

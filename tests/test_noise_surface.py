@@ -16,7 +16,8 @@ CAMERA = camera()
 @pytest.mark.parametrize("turn", [0.0, 0.7, 2.5])
 def test_incidence_on_a_plane_is_the_angle_to_each_ray(degrees, turn):
     depth = plate(CAMERA, 1.3, degrees, turn)
-    difference = incidence(surface(depth), CAMERA) - angles(CAMERA, degrees, turn)
+    found = incidence(surface(depth), CAMERA).reshape(depth.shape)
+    difference = found - angles(CAMERA, degrees, turn)
     assert np.degrees(np.abs(difference)).max() < 0.5
 
 
@@ -29,12 +30,13 @@ def test_a_step_is_an_edge_on_both_sides():
     depth = np.full((20, 30), 1.0, np.float32)
     depth[:, 15:] = 1.2
     shown = surface(depth)
-    assert np.flatnonzero(edges(shown)[4]).tolist() == [14, 15]
-    assert shown.across[4, 14] == pytest.approx(1 / 1.2 - 1)
-    assert shown.across[4, 15] == pytest.approx(1 - 1 / 1.2)
+    across = shown.across.reshape(depth.shape)
+    assert np.flatnonzero(edges(shown).reshape(depth.shape)[4]).tolist() == [14, 15]
+    assert across[4, 14] == pytest.approx(1 / 1.2 - 1)
+    assert across[4, 15] == pytest.approx(1 - 1 / 1.2)
     assert (shown.slope_u == 0).all()
-    across = surface(depth.T).across
-    assert np.array_equal(across, shown.across.T)
+    turned = surface(depth.T.copy()).across
+    assert np.array_equal(turned.reshape(30, 20).T, across)
 
 
 def test_a_small_step_and_a_crease_are_no_edges():
@@ -53,5 +55,7 @@ def test_pixels_without_neighbours_have_no_slope_and_nothing_measured_no_edge():
     for name in ("slope_u", "slope_v", "across"):
         assert (getattr(shown, name) == 0).all()
     assert np.isfinite(incidence(shown, camera(9))).all()
+    some = np.array([40, 3, 80])
+    assert np.array_equal(surface(depth, some).inverse, shown.inverse[some])
     depth[2:7, 2:7] = 0.7
     assert not edges(surface(depth)).any()
