@@ -33,6 +33,8 @@ class DiscoveryConfig:
 
     seeds: int = 72
     """Views registered with one another, 10 ms a pair."""
+    agreeing: float = 0.4
+    """Share of them, the most confident, that the first fit uses."""
     rotations: int = 1000
     """Of the grid that registration and search try."""
     searched: int = 144
@@ -58,13 +60,13 @@ class Trusted:
 
 
 def common_frame(views: Views, config: DiscoveryConfig) -> Posed:
-    """The half of the views that agree best, in one frame along the object's main directions."""
+    """The views that agree best, in one frame along the object's main directions."""
     count = len(views.points)
     pairs = torch.combinations(torch.arange(count)).flip(-1)
     rotations = rotation_grid(config.rotations)
     modes = register_pairs(views, pairs, rotations=rotations)
     consensus = agree(count, pairs, modes)
-    kept = consensus.confidence.topk((count + 1) // 2).indices
+    kept = consensus.confidence.topk(max(2, round(config.agreeing * count))).indices
     views = views.take(kept)
     rotation, translation = consensus.rotation[kept], consensus.translation[kept]
     normals = views.normals[:, ::4] @ rotation.mT

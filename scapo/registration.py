@@ -289,7 +289,11 @@ def _register(
 def _unrivalled(
     rotation: Float[Tensor, "Q K 3 3"], score: Float[Tensor, "Q K"]
 ) -> Float[Tensor, "Q K"]:
-    """Scores with 1 for modes that repeat a better one: all hypotheses came to the same pose."""
+    """Scores of modes that repeat a better one set a clear margin above the best.
+
+    All hypotheses came to the same pose, so nothing rivals it; the margin stays one that other
+    pairs reach too, or a few such pairs would outvote the rest.
+    """
     trace = torch.einsum("qkab,qlab->qkl", rotation, rotation)
     repeats = within(trace, 20.0).tril(-1).any(-1)
-    return torch.where(repeats, torch.ones_like(score), score)
+    return torch.where(repeats, score[:, :1] + 0.1, score)
