@@ -124,13 +124,13 @@ def _picture(blocks: list[list[Tile]]) -> bytes:
 
 
 def _heading(figure, manifest: Manifest, top: float, height: float) -> None:  # noqa: ANN001
-    y = top - 0.3 / height
+    x, y = 0.012, top - 0.3 / height
     title = f"{manifest.category}  {manifest.split}"
-    figure.text(0.012, y, title, fontsize=11, weight="bold", color=INK)
-    x = 0.012 + 0.0105 * len(title) * 6 / figure.get_size_inches()[0] * 2.1
+    words = [figure.text(x, y, title, fontsize=11, weight="bold", color=INK)]
     for p, name in enumerate(manifest.parts):
-        figure.text(x, y, f"● {name}", fontsize=9, color=PART_COLORS[p % len(PART_COLORS)])
-        x += (0.1 * (len(name) + 3)) / figure.get_size_inches()[0]
+        x += (words[-1].get_window_extent().width + 0.15 * DPI) / figure.bbox.width
+        color = PART_COLORS[p % len(PART_COLORS)]
+        words.append(figure.text(x, y, f"● {name}", fontsize=9, color=color))
 
 
 def _draw(axes: Axes, tile: Tile) -> None:

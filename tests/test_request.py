@@ -10,6 +10,7 @@ import pytest
 
 from sim_assets import shards
 from sim_assets.generate import Running, generate
+from sim_assets.ledger import GenerateError
 from sim_assets.options import DataOptions
 from sim_assets.request import make_request
 from sim_assets.stream import stream
@@ -46,6 +47,20 @@ def test_a_folder_of_models_in_place_of_a_generator(tmp_path, shared_dir):
     assert not Path(record.source).is_absolute()
     assert made.manifest.options["source"] == "urdf"
     assert str(source) not in (tmp_path / "split/manifest.json").read_text()
+
+
+def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
+    def full(*arguments: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shards, "write", full)
+    request, assets = make_request("laptop", FULL)
+    message = r"split/00000\.safetensors: expected to be written, found: No space left on device"
+    with pytest.raises(GenerateError, match=message):
+        generate(request, assets, tmp_path / "split", {}, Running(workers=0))
+    monkeypatch.setattr("sim_assets.ledger.write_bytes", full)
+    with pytest.raises(GenerateError, match=r"other: expected to be written to, found: No space"):
+        generate(request, assets, tmp_path / "other", {}, Running(workers=0))
 
 
 def test_a_model_that_has_changed_since_the_plan_is_refused():
