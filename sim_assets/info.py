@@ -112,7 +112,10 @@ def _histograms(split: Split) -> list[str]:
 
 
 def histogram(name: str, values: Float[np.ndarray, " K"], unit: str) -> str:
-    """One line: name, least value, bars, greatest value and unit, mean."""
+    """One line: name, least value, bars, greatest value and unit, mean; of the known values."""
+    values = values[~np.isnan(values)]
+    if not len(values):
+        return f"  {name:22} unknown"
     low, high = float(values.min()), float(values.max())
     counts, _ = np.histogram(values, bins=BINS, range=(low, high if high > low else low + 1))
     level = np.ceil(counts / counts.max() * (len(BARS) - 1)).astype(int)
