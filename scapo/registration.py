@@ -296,4 +296,5 @@ def _unrivalled(
     """
     trace = torch.einsum("qkab,qlab->qkl", rotation, rotation)
     repeats = within(trace, 20.0).tril(-1).any(-1)
-    return torch.where(repeats, score[:, :1] + 0.1, score)
+    clear = torch.maximum(score[:, :1] + 0.1, score.amax(1, keepdim=True))
+    return torch.where(repeats, clear, score)
