@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, Literal, TypeVar
 
@@ -61,7 +63,32 @@ class _Worker:
     heard: float = 0.0
 
 
-class Pool(Generic[Job, Result]):
+class AbstractPool(ABC, Generic[Job, Result]):
+    """Something that does jobs; a context manager, and leaving it stops them."""
+
+    @abstractmethod
+    def run(
+        self,
+        function: Callable[[Job, Report], Result],
+        jobs: Iterable[Job],
+        on_report: Callable[[Job, str, int], None] | None = None,
+    ) -> Iterator[Outcome[Job, Result]]:
+        """Do the jobs; outcomes come in the order in which they end.
+
+        Args:
+            function: Module-level, does one job.
+            jobs: Handed out in order.
+            on_report: Called in this process with the job and each of its reports.
+        """
+
+    @abstractmethod
+    def __enter__(self) -> AbstractPool[Job, Result]: ...
+
+    @abstractmethod
+    def __exit__(self, *exc: object) -> None: ...
+
+
+class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
     """Worker processes, as a context manager; leaving it ends them.
 
     Args of the constructor: `workers` processes, 0 for none: then jobs are done in this process,
@@ -90,13 +117,7 @@ class Pool(Generic[Job, Result]):
         jobs: Iterable[Job],
         on_report: Callable[[Job, str, int], None] | None = None,
     ) -> Iterator[Outcome[Job, Result]]:
-        """Do the jobs; outcomes come in the order in which they end.
-
-        Args:
-            function: Module-level, does one job.
-            jobs: Handed out in order.
-            on_report: Called in this process with the job and each of its reports.
-        """
+        """See `AbstractPool.run`."""
         waiting = deque(jobs)
         if not self.size:
             yield from (_do_here(function, job, on_report) for job in waiting)
@@ -234,6 +255,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 def _work(pipe: Connection) -> None:
     """A worker: do what comes through the pipe until it closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
     def report(label: str, amount: int = 0) -> None:
         pipe.send(("report", label, amount))
@@ -249,6 +271,14 @@ def _work(pipe: Connection) -> None:
             except Exception as error:  # noqa: BLE001 - whatever it is, it costs this job only
                 message = ("error", None, describe_error(error))
             pipe.send(message)
+
+
+def _end_with_parent() -> None:
+    """A job that sends nothing would not notice that the parent was killed."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def describe_error(error: BaseException) -> str:

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from scapo.categories import category as find_category
-from scapo.jobs import Outcome, Pool
+from scapo.cluster import Engine, open_pool
+from scapo.jobs import AbstractPool, Outcome
 from scapo.manifest import Manifest, Shard, shards_digest
 from sim_assets.assets import Asset
 from sim_assets.ledger import GenerateError, Ledger
@@ -25,7 +26,7 @@ from sim_assets.plan import (
     samples_per_instance,
     used_instances,
 )
-from sim_assets.shards import ShardDone, ShardJob, describe, render_shard
+from sim_assets.shards import ShardDone, ShardJob, describe, render_shard, render_shard_alike
 
 Progress = Callable[[str, int, int], None]
 
@@ -38,7 +39,9 @@ def _silent(what: str, done: int, total: int) -> None:
 class Running:
     """How a split is made: nothing here changes its bytes."""
 
-    workers: int = 1
+    workers: int | None = 1
+    """None: one per core, of this machine or of the cluster."""
+    engine: Engine = "local"
     timeout: float = 300.0
     """Seconds without a sign of life after which an object counts as hanging."""
     strict: bool = False
@@ -89,7 +92,7 @@ def generate(
     }
     with (
         Ledger(folder, identity, versions) as ledger,
-        Pool[Any, Any](running.workers, timeout=running.timeout) as pool,
+        open_pool(running.engine, running.workers, timeout=running.timeout) as pool,
     ):
         finished = ledger.finished()
         complete = _complete(ledger, finished)
@@ -124,7 +127,7 @@ def _complete(ledger: Ledger, finished: Mapping[str, ShardDone]) -> Made | None:
     return Made(folder=ledger.folder, manifest=manifest, kept=len(finished))
 
 
-def _make(ledger: Ledger, pool: Pool[Any, Any], work: _Work, running: Running) -> Made:
+def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Running) -> Made:
     request, instances = work.request, len(work.entries)
     used = work.entries[: used_instances(request, instances)]
     options = {
@@ -133,7 +136,7 @@ def _make(ledger: Ledger, pool: Pool[Any, Any], work: _Work, running: Running) -
     }
     jobs = [
         ShardJob(
-            folder=ledger.folder,
+            folder=ledger.folder.absolute(),
             request=request,
             plan=plan,
             options=options,
@@ -161,7 +164,7 @@ def _make(ledger: Ledger, pool: Pool[Any, Any], work: _Work, running: Running) -
 
 
 def _describe(
-    pool: Pool[Any, Any], assets: Sequence[Asset], wanted: int, running: Running
+    pool: AbstractPool[Any, Any], assets: Sequence[Asset], wanted: int, running: Running
 ) -> tuple[tuple[Entry, ...], dict[str, str]]:
     """Read objects until there are enough; those that cannot be read come with the reason."""
     found: dict[str, Entry] = {}
@@ -187,7 +190,7 @@ def _describe(
 
 
 def _render(
-    ledger: Ledger, pool: Pool[Any, Any], jobs: list[ShardJob], running: Running
+    ledger: Ledger, pool: AbstractPool[Any, Any], jobs: list[ShardJob], running: Running
 ) -> dict[str, ShardDone]:
     """Render the shards; one whose worker died or hung is tried again without that object."""
     done: dict[str, ShardDone] = {}
@@ -200,9 +203,10 @@ def _render(
         running.progress("samples", sum(amount.values()), total)
 
     running.progress("samples", 0, total)
+    function = render_shard if running.engine == "local" else render_shard_alike
     while jobs:
         again = []
-        for outcome in pool.run(render_shard, jobs, heard):
+        for outcome in pool.run(function, jobs, heard):
             if outcome.result is None:
                 amount.pop(outcome.job.plan.file, None)
                 again.append(_without(outcome, running.strict))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +24,8 @@ from sim_assets.shards import ShardDone, read_done
 
 PLAN = ".plan.json"
 FINISHED = ".finished"
+SEEN = 60.0
+"""Seconds after which a shard that another machine wrote must be seen here."""
 PLAN_FORMAT = "scapo-plan/1"
 
 
@@ -135,7 +138,21 @@ class Ledger:
         return done
 
     def record(self, shard: ShardDone) -> None:
-        """Note that a shard is finished."""
+        """Note that a shard is finished.
+
+        Raises:
+            GenerateError: Another machine says that it wrote it, but it is not there.
+        """
+        path = self.folder / shard.file
+        until = time.monotonic() + SEEN
+        while not path.exists():  # a network file system may show it late
+            if time.monotonic() > until:
+                raise GenerateError(
+                    f"{path}: expected a shard that is said to be written, found none: is the "
+                    "folder on storage that all machines share?"
+                )
+            time.sleep(0.1)
+            os.listdir(self.folder)  # noqa: PTH208 - makes an NFS client look again
         with (self.folder / FINISHED).open("a") as file:
             file.write(f"{shard.sha256}  {shard.file}\n")
 

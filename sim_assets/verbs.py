@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,6 +14,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from sim_assets.benchmark_verb import Benchmark
 from sim_assets.console import progress_bar, show_made, watched
 from sim_assets.import_verb import Import
 from sim_assets.options import DataOptions
@@ -123,10 +125,11 @@ class Generate:
     out: Path
     """Folder of the data set."""
     data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
-    workers: int = os.cpu_count() or 1
-    """Processes; 0: work in this one, unprotected against objects that crash or hang."""
-    engine: Literal["local"] = "local"
-    """Where they run."""
+    workers: int | None = None
+    """Processes, by default one per core; 0: work in this one, unprotected against objects that
+    crash or hang."""
+    engine: Literal["local", "ray"] = "local"
+    """Where they run: on this machine, or on the Ray cluster of RAY_ADDRESS (docs/cluster.md)."""
     timeout: float = 300.0
     """Seconds without a sign of life after which an object counts as hanging and is left out."""
     strict: bool = False
@@ -138,7 +141,10 @@ class Generate:
         from sim_assets.request import make_request, versions
 
         started = time.monotonic()
-        request, assets = make_request(self.category, self.data)
+        source = self.data.source
+        if source != "procedural":  # workers elsewhere stand in another folder
+            source = str(Path(source).absolute())
+        request, assets = make_request(self.category, replace(self.data, source=source))
         folder = self.out / self.category / self.data.split
         with progress_bar(console) as show:
             made = generate(
@@ -148,6 +154,7 @@ class Generate:
                 versions(request.settings.backend, request.settings.protocol),
                 Running(
                     workers=self.workers,
+                    engine=self.engine,
                     timeout=self.timeout,
                     strict=self.strict,
                     progress=show,
@@ -170,7 +177,7 @@ class Info:
 
         whole = True
         for report in describe_folder(self.path):
-            console.print(report.text)
+            console.print(report.text, soft_wrap=True, highlight=False, markup=False)
             whole &= report.whole
         return 0 if whole else 1
 
@@ -199,13 +206,43 @@ class Preview:
         return 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """Show a data set in the browser: clouds by part, joint axes, the object; Ctrl-C ends it."""
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+    port: int = 8080
+    """To listen at; the next free one is taken if it is in use."""
+    host: str = "localhost"
+    """Address to listen at; 0.0.0.0 lets other machines in."""
+    source: Path | None = None
+    """Folder of the models that the data set was made from, to show their meshes."""
+
+    def run(self, console: Console) -> int:
+        """Serve until interrupted."""
+        from sim_assets.view import Viewer
+
+        viewer = Viewer(self.path, self.source, self.host, self.port)
+        try:
+            console.print(f"{viewer.url} (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            console.print("ended")
+        finally:
+            viewer.close()
+        return 0
+
+
 VERBS: dict[str, type] = {
     "doctor": Doctor,
     "build": Build,
     "check": Check,
     "generate": Generate,
+    "benchmark": Benchmark,
     "import": Import,
     "info": Info,
+    "view": View,
     "preview": Preview,
 }
 """In the order of the help."""
