@@ -133,6 +133,7 @@ def to_arrays(prediction: Prediction) -> Arrays:
         "joint_state": None if joints is None else joints.state,
         "canonical_points": prediction.canonical_points,
         "confidence_sample": prediction.confidence,
+        **{f"record_{name}": tensor for name, tensor in (prediction.record or {}).items()},
     }
     return {
         name: tensor.detach().cpu().numpy().astype(np.float32)

@@ -7,6 +7,7 @@ field; `a_T_b` maps coordinates in frame b to frame a. Metres and radians throug
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -143,3 +144,5 @@ class Prediction:
     canonical_points: Float[Tensor, "*B M 3"] | None = None
     """The object in the method's canonical frame and state, metres."""
     confidence: Float[Tensor, "*B"] | None = None
+    record: Mapping[str, Tensor] | None = None
+    """Network-side quantities that a published evaluator needs, by its names, batch first."""

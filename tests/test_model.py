@@ -152,6 +152,23 @@ def test_part_poses_differ_by_the_joint_motion() -> None:
     assert_close(poses[:, 1] @ invert(poses[:, 0]), motion, atol=1e-4, rtol=0)
 
 
+def test_the_record_places_joints_as_the_published_evaluator_does() -> None:
+    model = tiny().eval()
+    model.load_state_dict(trained_state())
+    points = plates(4, 96, seed=5)[0].points
+    prediction = predict(model, points)
+    record, joints = prediction.record, prediction.joints
+    assert record is not None
+    assert joints is not None
+    inside = record["S_joint"][:, 0] + record["T_select"]
+    placed = (record["R_select"] @ inside[..., None])[..., 0]
+    radius = (points - points.mean(1, keepdim=True)).norm(dim=-1).mean(1)
+    metres = placed * (radius / 0.25)[:, None] + points.mean(1)
+    assert_close(metres, joints.pivot[:, 0])
+    states = record["S_angl"].diff(dim=-1) - record["I_angl"].diff(dim=-1)
+    assert_close(states[..., 0], joints.state)
+
+
 def test_labels_change_nothing_unless_supervised() -> None:
     observation, labels = plates(8, 96)
     step = Step(stage=ARTICULATE, progress=0.1, generator=generator(0))
