@@ -29,6 +29,7 @@ from sim_assets.options import DataOptions
 from sim_assets.recover import RecoverError, recover
 from sim_assets.request import make_request, versions
 from sim_assets.view import Viewer
+from sim_assets.view_scene import Shown
 from tests.browser import open_page
 
 pytestmark = [
@@ -163,6 +164,22 @@ def test_a_cloud_without_object_or_pose_is_shown(data: Path, tmp_path: Path):
         assert len(viewer.stage.axes) == 1
     finally:
         viewer.close()
+
+
+def test_the_size_of_a_cloud_is_not_that_of_its_stray_points():
+    points = np.zeros((1000, 3), np.float32)
+    points[:, 0] = np.linspace(0, 1, 1000)
+    points[5] = 50
+    shown = Shown(
+        points=points,
+        colors=np.zeros((1000, 3), np.uint8),
+        camera_T_object=np.full((4, 4), np.nan),
+        pivot=np.zeros((0, 3)),
+        axis=np.zeros((0, 3)),
+        camera=np.zeros(6),
+    )
+    assert shown.reach == pytest.approx(0.98, abs=0.002)
+    assert not shown.placed
 
 
 def near(picture: np.ndarray, color: str) -> int:
