@@ -75,12 +75,13 @@ METHODS = {
     "eap": "EAP",
     "op-align": "OP-Align",
     "scapo": "SCAPO",
+    "registered": "SCAPO, registered",
     "constant": "Constant prediction",
     "oracle-pose": "Oracle pose",
 }
 """A predictions file's method -> what a table calls it."""
 
-ORDER = ("3DGCN", "PointNet++", "NPCS-EPN", "ICP", "EAP", "OP-Align", "SCAPO")
+ORDER = ("3DGCN", "PointNet++", "NPCS-EPN", "ICP", "EAP", "OP-Align", "SCAPO", "SCAPO, registered")
 """Of the rows of a block."""
 
 PAPER_METHODS = {"Ours": "SCAPO", "OP-Align(SJ)": "OP-Align"}
