@@ -134,7 +134,7 @@ def real_record(view: View, theirs_R_ours: np.ndarray, seed: int = 0) -> dict[st
     place, first = np.unique(row * 640 + column, return_index=True)
     pc = np.zeros((SIZE, 3))
     pc[place] = 10 * view.points[first] @ FLIP
-    segmentation = np.zeros(SIZE, np.int64)
+    segmentation = np.zeros(SIZE, np.uint8)
     segmentation[place] = view.part[first] + 1
     detection = np.zeros(SIZE, bool)
     detection[place] = True
@@ -149,7 +149,7 @@ def real_record(view: View, theirs_R_ours: np.ndarray, seed: int = 0) -> dict[st
     part = np.concatenate([rotation.reshape(-1, 9), 10 * poses[:, :3, 3] @ FLIP, size], axis=1)
     return {
         "pc": pc,
-        "color": rng.uniform(size=(SIZE, 3)),
+        "color": rng.random((SIZE, 3), np.float32),
         "detection": detection,
         "segmentation": segmentation,
         "part": part,

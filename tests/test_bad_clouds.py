@@ -53,12 +53,15 @@ BAD_REAL = {
 }
 
 
+@pytest.fixture(scope="module")
+def real() -> Record:
+    return foreign.real_record(foreign.view_of(boxes.laptop(), [0.5], seed=1, count=300), np.eye(3))
+
+
 @pytest.mark.parametrize("name", BAD_REAL)
-def test_bad_real_files_are_named_with_the_reason(name: str, tmp_path: Path):
+def test_bad_real_files_are_named_with_the_reason(name: str, real: Record, tmp_path: Path):
     change, message = BAD_REAL[name]
-    view = foreign.view_of(boxes.laptop(), [0.5], seed=1, count=300)
-    record = change(foreign.real_record(view, np.eye(3)))
-    path = foreign.write_npz(record, tmp_path / "laptop_output/train/a/b/input_2/1.npz")
+    path = foreign.write_npz(change(real), tmp_path / "laptop_output/train/a/b/input_2/1.npz")
     with pytest.raises(ValueError, match=message) as caught:
         import_set("op-align-real", tmp_path, tmp_path / "out", strict=True)
     assert str(caught.value).startswith(f"{path}: ")
