@@ -10,7 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.geometry import rigid
+from scapo.joint_fit import oriented_nearest
 from scapo.points import Similarity
+from scapo.sightings import surface_normals
 from scapo.template import ArticulatedTemplate, Placement
 from scapo.types import Joints, Prediction
 
@@ -70,3 +72,16 @@ def canonical_points(template: ArticulatedTemplate, placement: Placement) -> Flo
         state=torch.zeros_like(placement.state),
     )
     return template.place(still)[0]
+
+
+@torch.no_grad()
+def nearest_weights(
+    template: ArticulatedTemplate,
+    points: Float[Tensor, "B N 3"],
+    placement: Placement,
+    camera: Float[Tensor, "B 3"],
+) -> Float[Tensor, "B N P"]:
+    """Part weights of the placed template's point that is nearest in position and normal."""
+    normals = surface_normals(points, points, camera)
+    index = oriented_nearest(points, normals, *template.place(placement))
+    return template.logit.softmax(-1)[index]

@@ -9,7 +9,7 @@ learning. No label is used anywhere: starts, hypotheses and trust are chosen by 
 views alone. Camera positions of the training clouds are known (their frame's origin).
 
 Prediction knows no camera: the network estimates it. `fast` is the network alone; `refine` fits
-the template to the cloud from the network's four hypotheses.
+the template to the cloud from the network's four hypotheses and the best of a grid.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import ClassVar
 
 import roma
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -29,17 +30,18 @@ from scapo.discovery import (
     evenly,
     improve,
     search_all,
+    seen_states,
     trust_order,
 )
-from scapo.joint_fit import oriented_nearest
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
-from scapo.placed import placed_prediction, slides
+from scapo.placed import nearest_weights, placed_prediction, slides
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
 from scapo.points import farthest_points, gather, nearest, normalise
-from scapo.pose_search import Found, best_of, refine
+from scapo.pose_search import Found, SearchSpace, best_of, propose, refine
 from scapo.pseudo_placements import PseudoPlacements
-from scapo.sightings import Views, observe, surface_normals
-from scapo.template import ArticulatedTemplate, Placement
+from scapo.registration import rotation_grid
+from scapo.sightings import Views, observe
+from scapo.template import ArticulatedTemplate, Placement, interleave, turn_placement
 from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
 
 
@@ -60,6 +62,8 @@ class RegisteredConfig:
     """Of the network; 48 gives 0.2 million parameters."""
     points: int = 256
     """Of each cloud."""
+    grid_hypotheses: int = 6
+    """Placements of a grid search that `refine` tries beside the network's four; 0 for none."""
     network_rounds: bool = True
     """Whether the network's proposals are searched and the template fitted again."""
 
@@ -152,7 +156,7 @@ class RegisteredScapo(AbstractMethod):
             proposals, _ = self._hypotheses(views.points)
         count = len(views.points)
         own = self.pseudo.placement()
-        mixed = _interleave(proposals, own, count)
+        mixed = interleave([proposals, own], count)
         index = torch.arange(count).repeat_interleave(5)
         placement, loss = refine(self.template, views.take(index), mixed, generator=generator)
         return best_of(placement, loss, count)
@@ -239,44 +243,50 @@ class RegisteredScapo(AbstractMethod):
             chosen = placement.take(row)
         else:
             chosen, camera, confidence = self._refined(points, placement, votes, row)
-            weight = self._weights(points, chosen, camera)
+            weight = nearest_weights(self.template, points, chosen, camera)
         return placed_prediction(self.template, chosen, weight, similarity, confidence)
 
     @torch.enable_grad()
     def _refined(
         self, points: Tensor, placement: Placement, votes: Votes, row: Tensor
     ) -> tuple[Placement, Float[Tensor, "B 3"], Float[Tensor, " B"]]:
-        """The best of the four hypotheses after a few steps of the fit, and its camera."""
+        """The best hypothesis of network and grid after a few steps of the fit, and its camera.
+
+        All happens in the first principal frame of each cloud, so that the grids of rotations
+        and of the depth image turn with it.
+        """
         count = len(points)
         camera = (placement.rotation @ votes.camera[..., None])[..., 0] + placement.translation
         camera = camera[row]
-        views = observe(points, camera, count=self.config.points)
+        frame = principal_frames(points)[:, 0]
+        turned = (frame @ camera[..., None])[..., 0]
+        views = observe(points @ frame.mT, turned, count=self.config.points)
+        start = [turn_placement(placement, frame.repeat_interleave(4, 0))]
+        if self.config.grid_hypotheses:
+            start.append(propose(self.template, views, self._space()))
+        number = len(start[0].state) // count + len(start[1:]) * self.config.grid_hypotheses
+        many = views.take(torch.arange(count).repeat_interleave(number))
         generator = torch.Generator().manual_seed(0)
-        four = views.take(torch.arange(count).repeat_interleave(4))
         quick, loss = refine(
-            self.template, four, placement, generator=generator, steps=12, points=96
+            self.template, many, interleave(start, count), generator=generator, steps=12, points=80
         )
         found = best_of(quick, loss, count)
         final, _ = refine(
             self.template, views, found.placement, generator=generator, steps=25, points=192
         )
-        return final, camera, found.margin
+        return turn_placement(final, frame.mT), camera, found.margin
 
-    def _weights(
-        self, points: Float[Tensor, "B N 3"], placement: Placement, camera: Float[Tensor, "B 3"]
-    ) -> Float[Tensor, "B N P"]:
-        """Part weights of the nearest template point in position and normal."""
-        normals = surface_normals(points, points, camera)
-        placed, placed_normals = self.template.place(placement)
-        index = oriented_nearest(points, normals, placed, placed_normals)
-        return self.template.logit.softmax(-1)[index]
-
-
-def _interleave(four: Placement, one: Placement, count: int) -> Placement:
-    """Four hypotheses of each view and one more, in a row."""
-    index = torch.arange(count)[:, None]
-    order = torch.cat([index * 4 + torch.arange(4), 4 * count + index], 1).flatten()
-    return Placement.cat([four, one]).take(order)
+    def _space(self) -> SearchSpace:
+        """States and cameras of the trusted training views."""
+        trusted = self.pseudo.trust > 0
+        return SearchSpace(
+            states=seen_states(
+                self.pseudo.state[trusted], 5 if len(self.template.kinds) == 1 else 3
+            ),
+            rotations=rotation_grid(self.config.discovery.rotations),
+            cameras=F.normalize(self.pseudo.camera[trusted], dim=-1),
+            keep=self.config.grid_hypotheses,
+        )
 
 
 def cpu_config() -> RegisteredConfig:

@@ -8,7 +8,7 @@ scales along the template's axes, and for prismatic joints where on the body the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import roma
 import torch
@@ -151,3 +151,23 @@ class ArticulatedTemplate(nn.Module):
         pivot = self.pivot * placement.log_scale.exp()[:, None] + placement.shift
         pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
         return pivot, self.directions() @ placement.rotation.mT
+
+
+def turn_placement(placement: Placement, turn: Float[Tensor, "B 3 3"]) -> Placement:
+    """The placements after every view's frame is turned, x -> turn x."""
+    return replace(
+        placement,
+        rotation=turn @ placement.rotation,
+        translation=(turn @ placement.translation[..., None])[..., 0],
+    )
+
+
+def interleave(sources: list[Placement], count: int) -> Placement:
+    """Hypotheses of `count` views from several sources, those of a view one after the other."""
+    sizes = [len(source.state) // count for source in sources]
+    starts = [sum(sizes[:k]) * count for k in range(len(sizes))]
+    view = torch.arange(count)[:, None]
+    columns = [
+        begin + view * size + torch.arange(size) for begin, size in zip(starts, sizes, strict=True)
+    ]
+    return Placement.cat(sources).take(torch.cat(columns, 1).flatten())

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import torch
-from sighted import template
+from sighted import sighted, template
 from strategies import generator
 from torch.testing import assert_close
 
 from scapo.geometry import apply, invert, joint_motion, random_rotations
-from scapo.placed import base_centre, canonical_points, placed_prediction, slides
+from scapo.placed import base_centre, canonical_points, nearest_weights, placed_prediction, slides
 from scapo.points import normalise
 from scapo.template import ArticulatedTemplate, Placement
 
@@ -44,3 +44,11 @@ def test_parts_and_joint_of_a_prediction_belong_together():
 def test_slides_are_marked():
     shape = ArticulatedTemplate(("revolute", "prismatic"), 5)
     assert slides(shape).tolist() == [[0.0], [1.0]]
+
+
+def test_weights_come_from_the_part_that_is_there():
+    views, truth = sighted(2, seed=70)
+    weight = nearest_weights(template(), views.points, truth, views.camera)
+    fine = nearest_weights(template(seed=9, count=3000), views.points, truth, views.camera)
+    assert (weight.argmax(-1) == fine.argmax(-1)).float().mean() > 0.95
+    assert_close(weight.sum(-1), torch.ones(2, views.points.shape[1]), atol=1e-5, rtol=0)

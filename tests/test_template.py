@@ -9,7 +9,7 @@ from strategies import generator
 from torch.testing import assert_close
 
 from scapo.geometry import apply, joint_motion, random_rotations, rigid
-from scapo.template import ArticulatedTemplate, Placement
+from scapo.template import ArticulatedTemplate, Placement, interleave, turn_placement
 from scapo.types import JointKind
 
 
@@ -56,3 +56,19 @@ def test_placements_are_taken_and_joined():
     back = Placement.cat([placement.take(torch.tensor([2, 3])), placement.take(torch.tensor([0]))])
     assert_close(back.state, placement.state[[2, 3, 0]])
     assert_close(back.shift, placement.shift[[2, 3, 0]])
+
+
+def test_hypotheses_of_a_view_stand_together():
+    turn = torch.eye(3).expand(6, 3, 3)
+    pairs = Placement.at(turn, torch.zeros(6, 3), torch.arange(6.0)[:, None])
+    singles = Placement.at(turn[:3], torch.zeros(3, 3), 10 + torch.arange(3.0)[:, None])
+    mixed = interleave([pairs, singles], 3)
+    assert mixed.state[:, 0].tolist() == [0, 1, 10, 2, 3, 11, 4, 5, 12]
+
+
+@torch.no_grad()
+def test_a_turned_placement_turns_the_points():
+    template, placement = drawn("revolute")
+    turn = random_rotations(4, generator(9))
+    points, _ = template.place(turn_placement(placement, turn))
+    assert_close(points, template.place(placement)[0] @ turn.mT, atol=1e-4, rtol=1e-4)
