@@ -17,6 +17,7 @@ from scapo.cluster import Engine, open_pool
 from scapo.jobs import AbstractPool, Outcome
 from scapo.manifest import Manifest, Shard, shards_digest
 from sim_assets.assets import Asset
+from sim_assets.card import CARD, write_card
 from sim_assets.ledger import GenerateError, Ledger
 from sim_assets.plan import (
     Entry,
@@ -97,6 +98,8 @@ def generate(
         finished = ledger.finished()
         complete = _complete(ledger, finished)
         if complete is not None:
+            if not (folder / CARD).exists():  # killed just before, or made by an older version
+                write_card(folder)
             return complete
         entries, refused = ledger.entries(assets) or _describe(
             pool, assets, request.instances, running
@@ -155,6 +158,7 @@ def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Ru
     failed = {name: why for shard in shards for name, why in shard.failed.items()}
     manifest = _manifest(ledger, options, request, used, shards, len(work.refused))
     ledger.finish(manifest, [shard.file for shard in shards if not shard.count])
+    write_card(ledger.folder)
     return Made(
         folder=ledger.folder,
         manifest=manifest,

@@ -21,6 +21,7 @@ from scapo.categories import CATEGORIES
 from scapo.manifest import Instance, Manifest, ManifestError, Shard, read_manifest, shards_digest
 from scapo.store import SAMPLES, canonical_json, write, write_bytes
 from sim_assets.archives import read_bytes
+from sim_assets.card import write_card
 from sim_assets.sources.clouds import CloudFile, RawCloud
 from sim_assets.views import generator
 
@@ -115,6 +116,7 @@ class SplitWriter:
         """Write the last shard and the manifest, and move the split to its place."""
         self._flush()
         write_bytes(self.place / "manifest.json", self._manifest(refused).to_json().encode())
+        write_card(self.place)
         old = self.folder.with_name(f".{self.folder.name}.old")
         shutil.rmtree(old, ignore_errors=True)
         if self.folder.exists():

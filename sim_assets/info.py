@@ -55,7 +55,7 @@ def describe_split(split: Split) -> Report:
     lines = [f"{split.folder}", *_facts(manifest)]
     try:
         split.verify()
-        lines += _histograms(split)
+        lines += histograms(split)
         lines.append(f"  shards     {len(manifest.shards)}, all whole")
     except StoreError as error:
         return Report(text="\n".join([*lines, f"  DAMAGED    {error}"]), whole=False)
@@ -87,9 +87,10 @@ def _facts(manifest: Manifest) -> list[str]:
     return lines
 
 
-def _histograms(split: Split) -> list[str]:
+def histograms(split: Split) -> list[str]:
+    """One line each for joint states, views, and the parts' share of points."""
     manifest = split.manifest
-    data = split.arrays("points", "part", "camera_T_part", "joint_state", "visible", "instance")
+    data = split.arrays("part", "camera_T_part", "joint_state", "visible", "instance")
     lines = []
     for j, joint in enumerate(manifest.joints):
         turning = joint.kind == "revolute"

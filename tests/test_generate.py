@@ -186,6 +186,7 @@ def test_objects_that_die_hang_or_fail_cost_themselves_only(tmp_path):
     assert [record.id for record in split.manifest.instances] == [f"object{i}" for i in range(5)]
     assert np.unique(split.arrays("instance")["instance"]).tolist() == [0, 4]
     assert {path.name for path in folder.iterdir()} == {
+        "card.md",
         "manifest.json",
         *(shard.file for shard in split.manifest.shards),
     }
