@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from sim_assets.articulated import ArticulatedObject
+from tests import boxes
 
 HINGE = "铰链（旋转）"  # noqa: RUF001 - the word as the files have it
 
@@ -196,6 +197,15 @@ def write_pt(record: object, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(record, path)  # noqa: TID251 - the layout under test
     return path
+
+
+def light_set(root: Path, names: dict[str, int]) -> None:
+    """Files `<root>/<name>/<index>.pt` for each folder name and number of files."""
+    view = view_of(boxes.laptop(), [0.5], seed=0, count=128)
+    for name, count in names.items():
+        for index in range(count):
+            record = light_record(view, np.eye(3), 0.42, (0, 1))
+            write_pt(record, root / name / f"{99 + index}.pt")
 
 
 class Calls:

@@ -11,13 +11,12 @@ import pytest
 
 from scapo.categories import CATEGORIES
 from scapo.store import open_split
-from sim_assets.__main__ import main
 from sim_assets.importing import import_set
 from sim_assets.info import describe_folder
 from sim_assets.procedural import generate
-from sim_assets.sources import op_align_light, op_align_real
+from sim_assets.sources import op_align_real
 from tests import boxes, foreign
-from tests.foreign import View
+from tests.foreign import View, light_set
 
 QUARTER = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 H = np.sqrt(0.5)
@@ -181,15 +180,6 @@ def test_light_axes_are_turned_so_that_states_are_positive(tmp_path: Path):
     np.testing.assert_array_equal(found["visible"], 1)
 
 
-def light_set(root: Path, names: dict[str, int], seed: int = 0) -> None:
-    """Files `<root>/<name>/<index>.pt` for each folder name and number of files."""
-    view = foreign.view_of(boxes.laptop(), [0.5], seed=seed, count=128)
-    for name, count in names.items():
-        for index in range(count):
-            record = foreign.light_record(view, EIGHTH, 0.42, (0, 1))
-            foreign.write_pt(record, root / name / f"{99 + index}.pt")
-
-
 def test_splits_instances_and_variants(tmp_path: Path):
     light_set(tmp_path / "a", {"full/laptop_h/train": 3, "full/laptop_h/test": 1})
     made = import_set("op-align-light", tmp_path / "a", tmp_path / "one", points=16)
@@ -239,38 +229,6 @@ def test_more_than_a_shard_and_too_few_points(tmp_path: Path):
     split.verify()
     points = split.arrays("points")["points"][69]
     assert len(np.unique(points, axis=0)) < 128  # with replacement
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
-
-
-def test_the_command_names_what_it_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    light_set(tmp_path / "set", {"full/laptop_h/train": 3})
-    command = ("import", "op-align-light", tmp_path / "set", "--out", tmp_path / "out")
-    assert run(*command, "--points", 32) == 0
-    assert "3 clouds in 1 splits" in capsys.readouterr().out
-    broken = tmp_path / "set/full/laptop_h/train/100.pt"
-    broken.write_bytes(broken.read_bytes()[:-100])
-    stray = foreign.write_pt({}, tmp_path / "set/notes.pt")
-    assert run(*command, "--points", 32) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert (
-        lines[0]
-        == f"left out {stray}: expected a place like {op_align_light.LAYOUT}, found another"
-    )
-    assert lines[1].startswith(f"left out {broken}: expected a whole zip archive, found ")
-    assert lines[2] == f"2 clouds in 1 splits in {tmp_path / 'out'}, 2 left out"
-    manifest = open_split(tmp_path / "out").manifest
-    assert (manifest.count, manifest.statistics) == (2, {"files_refused": 1.0})
-    assert run(*command, "--strict") == 1
-    printed = capsys.readouterr()
-    assert str(stray) in printed.err
-    assert printed.err.count("\n") == 1
-    assert open_split(tmp_path / "out").manifest.count == 2  # untouched
 
 
 def test_other_data_are_never_replaced(tmp_path: Path):
