@@ -2,7 +2,7 @@
 """Errors of the mask that tells the object from the rest: what a segmentation network does.
 
 Published depth noise says nothing of these; the sizes are choices, in pixels of a camera with a
-focal length of 600 pixels, and scale with the camera's.
+focal length of 600 pixels, and scale with the camera's. On narrow objects outlines err by less.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from scapo.camera import Intrinsics
+from sim_assets.noise_scene import outline
 
 FOCAL = 600.0
 
@@ -30,8 +31,10 @@ class MaskErrors:
     """Over which it changes, pixels."""
     missed: float = 0.3
     """Chance of a missing piece."""
-    size: tuple[float, float] = (0.04, 0.1)
-    """Its radius, as a share of the diagonal of the object's image."""
+    size: tuple[float, float] = (0.06, 0.16)
+    """Its radius, in sides of the square with the area of the object's image."""
+    narrow: float = 20.0
+    """Mean width of the object's image below which outlines err in proportion to it, pixels."""
 
 
 CHOSEN = MaskErrors()
@@ -52,10 +55,16 @@ def wrong_mask(
         model: Kinds and sizes.
     """
     pixel = camera.fx / FOCAL
-    grow = round(rng.uniform(*model.grow) * pixel)
+    error = min(pixel, mean_width(mask) / model.narrow)
+    grow = round(rng.uniform(*model.grow) * error)
     made = shrink(mask, -grow) if grow < 0 else grow_mask(mask, grow)
-    made = _wave(made, model.waves * pixel, model.wavelength * pixel, rng)
+    made = _wave(made, model.waves * error, model.wavelength * pixel, rng)
     return made & ~_piece(mask, rng, model)
+
+
+def mean_width(mask: Bool[np.ndarray, "H W"]) -> float:
+    """Of a shape, pixels: twice its area over the length of its outline; the width of a bar."""
+    return 2 * np.count_nonzero(mask) / max(np.count_nonzero(outline(mask)), 1)
 
 
 def grow_mask(mask: Bool[np.ndarray, "H W"], pixels: int) -> Bool[np.ndarray, "H W"]:
@@ -135,8 +144,6 @@ def _piece(
         return np.zeros_like(mask)
     height, width = mask.shape
     row, column = divmod(int(places[int(at * len(places))]), width)
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    diagonal = np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1)
-    radius = diagonal * (model.size[0] + size * (model.size[1] - model.size[0]))
+    radius = np.sqrt(len(places)) * (model.size[0] + size * (model.size[1] - model.size[0]))
     u, v = np.arange(width)[None] - column, np.arange(height)[:, None] - row
     return u * u + v * v < radius * radius

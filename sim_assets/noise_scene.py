@@ -57,8 +57,8 @@ class Clutter:
 
     chance: float = 0.5
     """Of a thing."""
-    size: tuple[float, float] = (0.06, 0.14)
-    """Its half axes, as shares of the diagonal of the object's image."""
+    size: tuple[float, float] = (0.1, 0.22)
+    """Its half axes, in sides of the square with the area of the object's image."""
     depth: float = 0.05
     """Standard deviation of its distance from the object's point beside it, m."""
 
@@ -82,12 +82,11 @@ def put_beside(
     """
     height, width = depth.shape
     draws, normal = rng.uniform(size=5), rng.standard_normal(3)
-    rows, columns = np.nonzero(_outline(seen))
+    rows, columns = np.nonzero(outline(seen))
     if draws[0] >= model.chance or not len(rows):
         return depth, np.zeros_like(seen)
     at = int(draws[1] * len(rows))
-    inside = np.argwhere(seen)
-    size = float(np.linalg.norm(np.ptp(inside, axis=0) + 1))
+    size = float(np.sqrt(np.count_nonzero(seen)))
     a, b = (size * (model.size[0] + float(x) * (model.size[1] - model.size[0])) for x in draws[2:4])
     cos, sin = float(np.cos(np.pi * draws[4])), float(np.sin(np.pi * draws[4]))
     du = np.arange(width, dtype=np.float32)[None] - columns[at]
@@ -102,7 +101,7 @@ def put_beside(
     return np.where(there, 1 / np.maximum(inverse, 1e-3), depth).astype(np.float32), there
 
 
-def _outline(seen: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def outline(seen: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Pixels of the object with a neighbour that is not."""
     inner = seen.copy()
     inner[1:] &= seen[:-1]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, distance_transform_edt, generate_binary_structure
 
-from sim_assets.noise_mask import MaskErrors, grow_mask, shrink, wrong_mask
+from sim_assets.noise_mask import MaskErrors, grow_mask, mean_width, shrink, wrong_mask
 from tests.depth_plates import camera, disc
 
 CAMERA = camera(200, 600)
@@ -57,10 +57,19 @@ def test_a_piece_is_missing_as_often_and_as_large_as_said():
         ]
     )
     assert (lost > 0).mean() == pytest.approx(0.4, abs=0.12)
-    diagonal = 0.6 * 200 * np.sqrt(2)
-    assert lost.max() <= np.pi * (0.2 * diagonal) ** 2 + 50
-    whole = lost[lost > 0]
-    assert whole.max() > np.pi * (0.1 * diagonal) ** 2
+    area = mask.sum()
+    assert lost.max() <= np.pi * 0.2**2 * area * 1.05
+    assert lost.max() > np.pi * 0.1**2 * area
+
+
+def test_outlines_of_narrow_objects_err_in_proportion_to_their_width():
+    bar = np.zeros((200, 200), bool)
+    bar[90:96, 20:180] = True
+    assert mean_width(bar) == pytest.approx(6, rel=0.1)
+    model = MaskErrors(grow=(10, 10), waves=0, missed=0)
+    assert wrong_mask(bar, CAMERA, np.random.default_rng(0), model).any(1).sum() == 6 + 2 * 3
+    bar[40:160] = True
+    assert wrong_mask(bar, CAMERA, np.random.default_rng(0), model).any(1).sum() == 120 + 2 * 10
 
 
 def test_without_errors_the_mask_is_itself_and_empty_masks_stay_empty():
