@@ -64,7 +64,7 @@ def describe_split(split: Split) -> Report:
 
 def _facts(manifest: Manifest) -> list[str]:
     options = manifest.options
-    told = ("protocol", "noise", "backend", "sampling", "source")
+    told = ("protocol", "preset", "noise", "mask", "backend", "sampling", "source")
     how = ", ".join(f"{name} {options[name]}" for name in told if options.get(name) is not None)
     lines = [
         f"  category   {manifest.category} ({', '.join(manifest.parts)}), split {manifest.split}",
