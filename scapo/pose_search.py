@@ -33,7 +33,7 @@ class SearchSpace:
     """template_R_view"""
     cameras: Float[Tensor, "V 3"] | None
     """Directions in the template frame near which cameras are sought, None for anywhere."""
-    keep: int = 12
+    keep: int = 40
     """Hypotheses of each view that are refined."""
 
 
@@ -159,16 +159,36 @@ def search(
 ) -> Found:
     """The best placement of every view over all rotations and states."""
     start = propose(template, views, space)
-    keep = space.keep
-    count, survivors = len(views.points), max(2, keep // 3)
-    index = torch.arange(count).repeat_interleave(keep)
-    quick, loss = refine(
-        template, views.take(index), start, generator=generator, steps=10, points=64
-    )
-    order = distinct(
-        quick.rotation.unflatten(0, (count, keep)), loss.view(count, keep), survivors, 15.0
-    )
-    chosen = (order + torch.arange(count)[:, None] * keep).flatten()
-    index = torch.arange(count).repeat_interleave(survivors)
-    placement, loss = refine(template, views.take(index), quick.take(chosen), generator=generator)
+    return tournament(template, views, start, generator=generator)
+
+
+ROUNDS = ((6, 48, 16), (12, 64, 5), (25, 96, 0))
+"""Of `tournament`: steps, points, and how many distinct hypotheses of a view go on."""
+
+
+def tournament(
+    template: ArticulatedTemplate,
+    views: Views,
+    start: Placement,
+    *,
+    generator: torch.Generator,
+) -> Found:
+    """The best of many hypotheses of each view (as many for each, one after the other).
+
+    All are refined a little, the best distinct ones further, and fewer still to the end: right
+    hypotheses are seldom the best before refinement, and few steps tell the hopeless ones.
+    """
+    count = len(views.points)
+    placement, loss = start, torch.zeros(len(start.state))
+    for steps, points, left in ROUNDS:
+        number = len(placement.state) // count
+        index = torch.arange(count).repeat_interleave(number)
+        placement, loss = refine(
+            template, views.take(index), placement, generator=generator, steps=steps, points=points
+        )
+        if left:
+            table = placement.rotation.unflatten(0, (count, number))
+            best = distinct(table, loss.view(count, number), min(left, number), 12.0)
+            chosen = (best + torch.arange(count)[:, None] * number).flatten()
+            placement, loss = placement.take(chosen), loss[chosen]
     return best_of(placement, loss, count)

@@ -37,7 +37,7 @@ from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
 from scapo.placed import nearest_weights, placed_prediction, slides
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
 from scapo.points import farthest_points, gather, nearest, normalise
-from scapo.pose_search import Found, SearchSpace, best_of, propose, refine
+from scapo.pose_search import Found, SearchSpace, best_of, propose, refine, tournament
 from scapo.pseudo_placements import PseudoPlacements
 from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
@@ -62,7 +62,7 @@ class RegisteredConfig:
     """Of the network; 48 gives 0.2 million parameters."""
     points: int = 256
     """Of each cloud."""
-    grid_hypotheses: int = 6
+    grid_hypotheses: int = 32
     """Placements of a grid search that `refine` tries beside the network's four; 0 for none."""
     network_rounds: bool = True
     """Whether the network's proposals are searched and the template fitted again."""
@@ -264,13 +264,8 @@ class RegisteredScapo(AbstractMethod):
         start = [turn_placement(placement, frame.repeat_interleave(4, 0))]
         if self.config.grid_hypotheses:
             start.append(propose(self.template, views, self._space()))
-        number = len(start[0].state) // count + len(start[1:]) * self.config.grid_hypotheses
-        many = views.take(torch.arange(count).repeat_interleave(number))
         generator = torch.Generator().manual_seed(0)
-        quick, loss = refine(
-            self.template, many, interleave(start, count), generator=generator, steps=12, points=80
-        )
-        found = best_of(quick, loss, count)
+        found = tournament(self.template, views, interleave(start, count), generator=generator)
         final, _ = refine(
             self.template, views, found.placement, generator=generator, steps=25, points=192
         )
