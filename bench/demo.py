@@ -49,8 +49,10 @@ class Demo:
     """Training clouds per category."""
     test: int = 200
     """Test clouds per category."""
-    epochs: int = 16
+    epochs: int = 10
     """Passes over the training clouds in each of the two stages of SCAPO as published."""
+    votes: int = 30
+    """Passes of the network of SCAPO by registration, after registration and joint fit."""
 
 
 def main() -> None:
@@ -78,7 +80,10 @@ def run_category(demo: Demo, category: str, console: Console) -> None:
     steps = Steps(demo.out, category, console)
     data = str(demo.out / "data")
     make_data(demo, steps, data)
-    flags = {"scapo": ["--preset", "cpu", "--epochs", str(demo.epochs)]}
+    flags = {
+        "scapo": ["--preset", "cpu", "--epochs", str(demo.epochs)],
+        "registered": ["--epochs", str(demo.votes), "0", "--no-network-rounds"],
+    }
     for method in METHODS:
         run = demo.out / "runs" / f"{category}-{method}"
         steps.bench(
