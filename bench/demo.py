@@ -223,7 +223,7 @@ Done in {seconds / 60:.1f} minutes: {demo.train} training and {demo.test} test c
 category rendered; SCAPO trained on the training clouds without labels, {demo.epochs} epochs a
 stage, far less than the benchmark's; ICP registered against five labelled training shapes; all
 scored on the test clouds. On partial views the paper's method needs more than this:
---methods registered is the variant that finds the joints (results/EXPERIMENTS.md).
+--methods registered is the variant made for them (results/EXPERIMENTS.md).
 
   tables    {demo.out}/tables/
   pictures  {demo.out}/pictures/  data, training curves, predictions (parts coloured, axes drawn)
