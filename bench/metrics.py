@@ -187,7 +187,7 @@ def joint_errors(
     nothing = np.full(pivot_true.shape[:2], np.nan)
     true = unit(axis_true)
     pred = None if axis_pred is None else unit(np.asarray(axis_pred, np.float64))
-    direction = nothing if pred is None else _line_degrees(true, pred)
+    direction = nothing if pred is None else line_degrees(true, pred)
     if pivot_pred is None or (kind == "line-line" and pred is None):
         return direction, nothing.copy()
     offset = np.asarray(pivot_pred, np.float64) - pivot_true
@@ -209,9 +209,10 @@ def unit(axis: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
     return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
 
 
-def _line_degrees(
+def line_degrees(
     a: Float[np.ndarray, "*B 3"], b: Float[np.ndarray, "*B 3"]
 ) -> Float[np.ndarray, "*B"]:
+    """Angle between two lines by their unit directions, at most 90 degrees; exact near 0."""
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.degrees(np.arctan2(sine, np.abs((a * b).sum(-1))))
 

@@ -20,6 +20,7 @@ from bench.reference import Kind, write_reference
 from bench.results import load
 from bench.score_files import side_file
 from bench.scores import Settings
+from bench.stability_verb import Stability
 from bench.tables import write
 
 
@@ -143,6 +144,7 @@ VERBS: dict[str, type] = {
     "evaluate": Evaluate,
     "tables": Tables,
     "explain": Explain,
+    "stability": Stability,
     "reference": Reference,
 }
 """In the order of the help."""
