@@ -21,9 +21,9 @@ from bench.predictions import Header, write_predictions
 from bench.train import pick_device
 from scapo.data import SampleDataset, label, observe
 from scapo.files import Arrays
-from scapo.fit import TIMING
 from scapo.method import AbstractMethod, Mode
 from scapo.resident import map_labels
+from scapo.run_folder import TIMING
 from scapo.store import open_split
 from scapo.types import Observation, Prediction
 

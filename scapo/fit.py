@@ -4,31 +4,37 @@
 All data lie on the device, batches are drawn by index there, randomness comes from two generators
 of one seed (order of the data on the host, augmentation on the device). A run that was killed
 continues from its last checkpoint with the same batches: on a CPU, bit for bit the same curve.
+
+Where the process belongs to a group (`ranks`, torchrun), each rank takes its share of every
+batch, gradients are summed, and the first rank alone starts stages, writes and logs.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
-import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from safetensors.numpy import load, save
+from torch import Tensor
 
-from scapo import checkpoint
-from scapo.files import Arrays, Header, canonical_json, read, write, write_bytes
+from scapo import checkpoint, precision
+from scapo.descent import Descent, NotFiniteError, adam, schedule
+from scapo.files import Arrays
 from scapo.layout import StoreError
 from scapo.log import Log
 from scapo.method import AbstractMethod, Stage, Step
+from scapo.post_mortem import BAD_BATCH, save_batch
+from scapo.precision import Arithmetic
+from scapo.progress_pictures import draw_progress
+from scapo.ranks import average_buffers, present
 from scapo.resident import TrainingData
-
-TIMING = "timing.json"
-"""What differs from run to run, apart from all that does not."""
+from scapo.run_folder import Position, RunFolder, State
 
 
 class TrainingError(ArithmeticError):
@@ -47,18 +53,11 @@ class FitConfig:
     """Seconds after which the end of an epoch saves the state."""
     clip: float = 10.0
     """Largest norm of the gradient; longer ones are scaled down."""
-
-
-@dataclass(slots=True)
-class Position:
-    """Where a run is: the next stage and epoch, and the steps done in all."""
-
-    stage: int = 0
-    epoch: int = 0
-    step: int = 0
-    seconds: float = 0.0
-    rates: dict[str, float] = field(default_factory=dict)
-    """Samples per second of each stage."""
+    arithmetic: Arithmetic = field(default_factory=Arithmetic)
+    """Precision and compilation of the networks."""
+    pictures_every: float | None = 300.0
+    """Seconds after which the end of an epoch draws the method's pictures, as does the end of a
+    stage; None: never."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,14 +91,15 @@ def fit(
 ) -> None:
     """Run all stages of a method and leave the run in `folder`.
 
-    Writes config.json, metrics.jsonl, tensorboard/ (where that package is installed),
-    checkpoint.safetensors and training.safetensors. With `resume` a run in that folder is
-    continued, or left as it is when it was finished.
+    Writes config.json, metrics.jsonl, tensorboard/ (where that package is installed), pictures/
+    (where matplotlib is), checkpoint.safetensors and training.safetensors. With `resume` a run in
+    that folder is continued, or left as it is when it was finished.
 
     Raises:
         TrainingError: The loss or its gradient is not finite.
         StoreError: `resume` with another configuration or other data, or a run is there without
-            `resume`.
+            `resume`; or the folder cannot be written, what was saved before is whole.
+        ValueError: Fewer samples in a batch than ranks, or a precision that the method lacks.
     """
     Trainer(method, data, folder, config, listener).run(resume=resume)
 
@@ -121,178 +121,181 @@ class Trainer:
         self.data = TrainingData(
             observation=data.observation, labels=allowed, digest=data.digest
         ).to(config.device)
-        self.folder, self.config, self.listener = folder, config, listener
-        self.order = torch.Generator().manual_seed(config.seed)
-        self.noise = torch.Generator(config.device).manual_seed(config.seed)
-        self.position = Position()
-        self.finished = False
-        self.saved = time.monotonic()
+        self.config, self.listener, self.ranks = config, listener, present()
+        seed = config.seed + (self.ranks.rank << 32)  # every rank augments in its own way
+        self.state = State(
+            position=Position(),
+            order=torch.Generator().manual_seed(config.seed),
+            noise=torch.Generator(config.device).manual_seed(seed),
+        )
+        self.folder = RunFolder(folder, method, self._about(), config.device)
+        self.descent = Descent(
+            method=method,
+            clip=config.clip,
+            arithmetic=config.arithmetic,
+            device=config.device,
+            ranks=self.ranks,
+            scaler=precision.scaler(config.arithmetic.precision, config.device),
+        )
+        self.saved = self.drawn = time.monotonic()
+
+    def _about(self) -> dict[str, Any]:
+        training = {**asdict(self.config.arithmetic), "clip": self.config.clip}
+        return {
+            "seed": self.config.seed,
+            "data_digest": self.data.digest,
+            "training": {**training, "ranks": self.ranks.count},
+        }
 
     def run(self, *, resume: bool) -> None:
         """All stages that are left."""
-        adam = self._open(resume=resume)
-        if self.finished:
-            return
-        self.log = Log(self.folder, self.position.step)
-        with contextlib.closing(self.log):
-            self._stages(adam)
+        finished, moments = False, None
+        with self._explained():
+            if self.folder.found(resume=resume):
+                finished, moments = self.folder.load(self.state, self.ranks.rank)
+            elif self.ranks.first:
+                self.folder.begin()
+            if finished:
+                return
+            self.ranks.wait()  # no rank looks for a run that another has begun
+            path = self.folder.path if self.ranks.first else None
+            self.log = Log(path, self.state.position.step, self.ranks.total)
+            with (
+                contextlib.closing(self.log),
+                precision.applied(self.method, self.config.arithmetic, self.config.device),
+            ):
+                self._stages(moments)
 
-    def _stages(self, adam: Arrays | None) -> None:
-        stages = self.method.stages()
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        """A full disk or a folder that cannot be written, as one line with what is left."""
+        try:
+            yield
+        except OSError as error:
+            raise StoreError(
+                f"{self.folder.path}: expected a folder that can be written, found "
+                f"{error.strerror or error}; {self.kept()}"
+            ) from error
+
+    def kept(self) -> str:
+        """What an interrupted run leaves, in words."""
+        step = self.folder.saved_step()
+        return "nothing was saved yet" if step is None else f"resume continues after step {step}"
+
+    def _stages(self, moments: Arrays | None) -> None:
+        position, stages = self.state.position, self.method.stages()
+        if moments is not None and position.scaler:
+            self.descent.scaler.load_state_dict(position.scaler)
         if not stages:
             self._start(Stage(name="", epochs=0, lr=0.0))
-        while self.position.stage < len(stages):
-            stage = stages[self.position.stage]
-            if self.position.epoch == 0:
+        while position.stage < len(stages):
+            stage = stages[position.stage]
+            if not position.started:
                 self._start(stage)
-            optimizer = self._optimizer(stage)
-            if adam is not None:
-                checkpoint.load_adam(optimizer, adam)
-                adam = None
+            optimizer = adam(self.method, stage)
+            if moments is not None:
+                checkpoint.load_adam(optimizer, moments)
+                moments = None
             self._stage(stage, optimizer)
-            self.position.stage, self.position.epoch = self.position.stage + 1, 0
+            position.stage, position.epoch, position.started = position.stage + 1, 0, False
+            self._draw(stage)
             self._save(None)
         self._save(None, finished=True)
 
-    def _open(self, *, resume: bool) -> Arrays | None:
-        """Begin a run, or load the state of the one that is there; Adam's part of it."""
-        path = self.folder / checkpoint.TRAINING
-        if not path.is_file():
-            text = json.dumps(self._header(finished=False), indent=1, sort_keys=True)
-            write_bytes(self.folder / "config.json", (text + "\n").encode())
-            return None
-        if not resume:
-            raise StoreError(
-                f"{self.folder}: expected no run there, found one; resume continues it"
-            )
-        arrays, header = read(path, checkpoint.TRAINING_FORMAT)
-        self._check_same(path, header["header"])
-        checkpoint.load_arrays(self.method, arrays, path, "weights/")
-        self.order.set_state(torch.from_numpy(arrays["generator/order"].copy()))
-        self.noise.set_state(torch.from_numpy(arrays["generator/noise"].copy()))
-        self.position = Position(**header["position"])
-        self.finished = header["header"]["finished"]
-        return arrays if header["optimizer"] else None
-
-    def _check_same(self, path: Path, found: Header) -> None:
-        """Refuse to continue a run of another method, configuration, seed or data."""
-        expected = json.loads(canonical_json(self._header(finished=False)))
-        for name in ("method", "category", "config", "seed", "data_digest", "supervision"):
-            if found[name] != expected[name]:
-                raise StoreError(
-                    f"{path}: {name}: expected {canonical_json(expected[name])} to resume, "
-                    f"found {canonical_json(found[name])}"
-                )
-
     def _start(self, stage: Stage) -> None:
-        self.method.start(stage.name, self.data.observation, self.data.labels, self.noise)
-
-    def _optimizer(self, stage: Stage) -> torch.optim.Adam:
-        groups = [
-            {"params": list(part.parameters()), "lr": stage.lr * group.rate}
-            for group in stage.parameters
-            for part in [self._part(group.module)]
-        ]
-        self.method.requires_grad_(False)
-        return torch.optim.Adam(groups, lr=stage.lr, weight_decay=stage.weight_decay, fused=True)
-
-    def _part(self, name: str) -> nn.Module:
-        return self.method.get_submodule(name) if name else self.method
+        """The method's start of a stage, by the first rank for all; saved, as it may take long."""
+        began = time.monotonic()
+        if self.ranks.first:
+            observation, labels = self.data.observation, self.data.labels
+            self.method.start(stage.name, observation, labels, self.state.noise)
+        if self.ranks.count > 1:
+            state = save(checkpoint.to_arrays(self.method)) if self.ranks.first else b""
+            arrays = load(self.ranks.from_first(state, self.config.device))
+            checkpoint.load_arrays(self.method, arrays, self.folder.path)
+        self.state.position.spend(stage.name, time.monotonic() - began)
+        self.state.position.started = True
+        if stage.epochs:
+            self._save(None)
 
     def _stage(self, stage: Stage, optimizer: torch.optim.Adam) -> None:
         """The epochs of a stage that are left."""
-        samples = self.data.observation.points.shape[0]
+        position, samples = self.state.position, self.data.observation.points.shape[0]
         size = min(stage.batch, samples)
+        if size < self.ranks.count:
+            raise ValueError(
+                f"batch: expected a sample for each of {self.ranks.count} ranks, found {size}"
+            )
         steps = samples // size
-        for epoch in range(self.position.epoch, stage.epochs):
+        for epoch in range(position.epoch, stage.epochs):
             began = time.monotonic()
             self.method.train()
-            order = torch.randperm(samples, generator=self.order)[: steps * size]
+            order = torch.randperm(samples, generator=self.state.order)[: steps * size]
             for number, index in enumerate(order.split(size)):
                 done = (epoch * steps + number) / (stage.epochs * steps)
                 self._step(stage, optimizer, index, done)
                 self.listener(Progress(stage=stage, epoch=epoch, done=done, loss=self.log.latest))
-            self.log.write(self.position.step, stage.name)
-            self.position.epoch = epoch + 1
+            self.log.write(position.step, stage.name)
+            average_buffers(self.method, self.ranks)
+            position.epoch = epoch + 1
             seconds = time.monotonic() - began
-            self.position.seconds += seconds
-            self.position.rates[stage.name] = steps * size / seconds
-            self.log.scalar("samples_per_second", steps * size / seconds, self.position.step)
-            if time.monotonic() - self.saved > self.config.checkpoint_every:
+            position.spend(stage.name, seconds)
+            position.rates[stage.name] = steps * size / seconds
+            self.log.scalar("samples_per_second", steps * size / seconds, position.step)
+            if self._due(self.saved, self.config.checkpoint_every):
                 self._save(optimizer)
+            every = self.config.pictures_every
+            if every is not None and self._due(self.drawn, every) and epoch + 1 < stage.epochs:
+                self._draw(stage)
+
+    def _due(self, last: float, every: float) -> bool:
+        """Whether so many seconds are over; the ranks agree, as each has its own clock."""
+        over = torch.tensor([float(time.monotonic() - last > every)], device=self.config.device)
+        return bool(self.ranks.total(over) > 0)
 
     def _step(self, stage: Stage, optimizer: torch.optim.Adam, index: Tensor, done: float) -> None:
         """One batch."""
-        rate = cosine(stage, done)
-        for group, settings in zip(stage.parameters, optimizer.param_groups, strict=True):
-            settings["lr"] = rate * group.rate
-            for parameter in settings["params"]:
-                parameter.requires_grad_(done >= group.begin)
-        observation, labels = self.data.batch(index.to(self.config.device))
-        step = Step(stage=stage.name, progress=done, generator=self.noise)
-        terms = self.method.losses(observation, labels, step)
-        total = torch.stack(list(terms.values())).sum()
-        if not bool(torch.isfinite(total)):
-            raise TrainingError(self._post_mortem("loss", stage, index, terms))
-        optimizer.zero_grad()
-        total.backward()
-        norm = nn.utils.clip_grad_norm_(self.method.parameters(), self.config.clip)
-        if not bool(torch.isfinite(norm)):
-            raise TrainingError(self._post_mortem("gradient", stage, index, terms))
-        optimizer.step()
-        self.position.step += 1
-        named = {f"loss/{name}": value for name, value in terms.items()}
-        self.log.collect({"loss": total, **named, "gradient": norm}, rate)
-        if self.position.step % self.config.log_every == 0:
-            self.log.write(self.position.step, stage.name)
+        rate = schedule(stage, optimizer, done)
+        own = self.ranks.share(index)
+        share = len(own) / len(index)
+        observation, labels = self.data.batch(own.to(self.config.device))
+        step = Step(stage=stage.name, progress=done, generator=self.state.noise)
+        compute = partial(self.method.losses, observation, labels, step)
+        try:
+            values = self.descent.step(optimizer, compute, share)
+        except NotFiniteError as problem:
+            message = self._post_mortem(problem, stage, own)
+            self.ranks.wait()  # the first to end takes the others with it
+            raise TrainingError(message) from None
+        self.state.position.step += 1
+        if values is not None:
+            weighted = {name: value.detach() * share for name, value in values.items()}
+            self.log.collect(weighted, rate)
+        if self.state.position.step % self.config.log_every == 0:
+            self.log.write(self.state.position.step, stage.name)
 
-    def _post_mortem(self, what: str, stage: Stage, index: Tensor, terms: dict[str, Tensor]) -> str:
-        """Save the batch; the message that names it."""
-        path = self.folder / "bad-batch.safetensors"
-        observation, _ = self.data.batch(index.to(self.config.device))
-        arrays = {"points": observation.points, "index": index}
-        values = {name: str(float(value.detach())) for name, value in terms.items()}
-        header = {"format": "scapo-bad-batch/1", "stage": stage.name, "terms": values}
-        write(path, {name: checkpoint.array(value) for name, value in arrays.items()}, header)
-        bad = [name for name, value in values.items() if not math.isfinite(float(value))]
+    def _post_mortem(self, problem: NotFiniteError, stage: Stage, index: Tensor) -> str:
+        """Save the batch where it is this rank's; the message that names it."""
+        path, step = self.folder.path / BAD_BATCH, self.state.position.step
+        found = f"rank {problem.rank} with another"
+        if problem.rank == self.ranks.rank:
+            observation, _ = self.data.batch(index.to(self.config.device))
+            found = save_batch(path, stage.name, observation.points, index, problem.terms)
         return (
-            f"{path}: expected a finite {what} in stage {stage.name!r} at step "
-            f"{self.position.step}, found {', '.join(bad) or 'finite terms with a bad gradient'}; "
-            "the batch is saved there"
+            f"{path}: expected a finite {problem.what} in stage {stage.name!r} at step {step}, "
+            f"found {found}; the batch is saved there"
         )
 
-    def _header(self, *, finished: bool) -> Header:
-        extra: dict[str, Any] = {
-            "seed": self.config.seed,
-            "data_digest": self.data.digest,
-            "supervision": sorted(self.method.supervision),
-            "steps": self.position.step,
-            "finished": finished,
-        }
-        return checkpoint.checkpoint_header(
-            self.method.name, self.method.config, self.method.category.name, extra
-        )
+    def _draw(self, stage: Stage) -> None:
+        """The method's pictures of a few fixed clouds, by the first rank."""
+        self.drawn = time.monotonic()
+        if self.config.pictures_every is not None and self.ranks.first:
+            draw_progress(
+                self.method, self.data.observation, stage.name, self.log, self.state.position.step
+            )
 
     def _save(self, optimizer: torch.optim.Adam | None, *, finished: bool = False) -> None:
-        """First the state that resume reads, whole in one file, then the weights alone."""
-        arrays = checkpoint.to_arrays(self.method, "weights/")
-        arrays |= {} if optimizer is None else checkpoint.adam_arrays(optimizer)
-        arrays["generator/order"] = checkpoint.array(self.order.get_state())
-        arrays["generator/noise"] = checkpoint.array(self.noise.get_state())
-        header = self._header(finished=finished)
-        training = {
-            "format": checkpoint.TRAINING_FORMAT,
-            "position": asdict(self.position),
-            "optimizer": optimizer is not None,
-            "header": header,
-        }
-        write(self.folder / checkpoint.TRAINING, arrays, training)
-        checkpoint.write_checkpoint(self.folder / checkpoint.WEIGHTS, self.method, header)
-        timing = {"seconds": self.position.seconds, "samples_per_second": self.position.rates}
-        write_bytes(self.folder / TIMING, (json.dumps(timing, indent=1) + "\n").encode())
+        noises = self.ranks.every(self.state.noise.get_state(), self.config.device)
+        self.state.position.scaler = self.descent.scaler.state_dict()
+        if self.ranks.first:
+            self.folder.save(self.state, noises, optimizer, finished=finished)
         self.saved = time.monotonic()
-
-
-def cosine(stage: Stage, done: float) -> float:
-    """Learning rate when this share of the stage is done: half a cosine from lr to min_lr."""
-    return stage.min_lr + (stage.lr - stage.min_lr) * (1 + math.cos(math.pi * done)) / 2

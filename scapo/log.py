@@ -5,26 +5,42 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 from torch import Tensor
 
+from scapo import draw
 from scapo.files import canonical_json, write_bytes
+from scapo.pictures import PictureData
+
+PICTURES = "pictures"
+"""Folder of the pictures of a run."""
+
+
+def alone(values: Tensor) -> Tensor:
+    """The sum over one rank."""
+    return values
 
 
 class Log:
     """Means over a few steps, one JSON line each; the same run writes the same bytes."""
 
-    def __init__(self, folder: Path, step: int) -> None:
-        """Open the log of a run that has done `step` steps; later lines are dropped."""
-        self.path = folder / "metrics.jsonl"
-        lines = self.path.read_text().splitlines() if self.path.is_file() else []
-        kept = [line for line in lines if _step_of(line) <= step]
-        write_bytes(self.path, "".join(f"{line}\n" for line in kept).encode())
-        self.file = self.path.open("a")
-        self.board = _board(folder / "tensorboard", step)
+    def __init__(
+        self, folder: Path | None, step: int, total: Callable[[Tensor], Tensor] = alone
+    ) -> None:
+        """Open the log of a run that has done `step` steps; later lines are dropped.
+
+        Args:
+            folder: Of the run; None: nothing is written, as on all ranks but the first.
+            step: Steps done.
+            total: Sums what the ranks have collected.
+        """
+        self.folder, self.total = folder, total
+        self.file = None if folder is None else _continued(folder / "metrics.jsonl", step)
+        self.board = None if folder is None else _board(folder / "tensorboard", step)
         self.sums: dict[str, Tensor] = {}
         self.count = 0
         self.rate = 0.0
@@ -43,11 +59,13 @@ class Log:
         if not self.count:
             return
         means = torch.stack([value.double() for value in self.sums.values()]) / self.count
+        means = self.total(means)
         row = dict(zip(self.sums, means.tolist(), strict=True))
         self.latest = row["loss"]
         record = {"step": step, "stage": stage, "lr": self.rate, **row}
-        self.file.write(canonical_json(record) + "\n")
-        self.file.flush()
+        if self.file is not None:
+            self.file.write(canonical_json(record) + "\n")
+            self.file.flush()
         for name, value in row.items():
             self.scalar(f"{stage}/{name}", value, step)
         self.sums, self.count = {}, 0
@@ -57,11 +75,29 @@ class Log:
         if self.board is not None:
             self.board.add_scalar(name, value, step)
 
+    def picture(self, name: str, picture: PictureData, step: int) -> None:
+        """A PNG in pictures/, replacing the one of that name, and an image for TensorBoard."""
+        if self.folder is None:
+            return
+        png, pixels = draw.render(picture)
+        write_bytes(self.folder / PICTURES / f"{name}.png", png)
+        if self.board is not None:
+            self.board.add_image(name, pixels, step, dataformats="HWC")
+
     def close(self) -> None:
         """Flush both."""
-        self.file.close()
+        if self.file is not None:
+            self.file.close()
         if self.board is not None:
             self.board.close()
+
+
+def _continued(path: Path, step: int) -> TextIO:
+    """The file, open for more, without lines after that step."""
+    lines = path.read_text().splitlines() if path.is_file() else []
+    kept = [line for line in lines if _step_of(line) <= step]
+    write_bytes(path, "".join(f"{line}\n" for line in kept).encode())
+    return path.open("a")
 
 
 def _step_of(line: str) -> float:

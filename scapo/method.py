@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from scapo.pictures import PictureData
 from scapo.types import Category, Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "refine"]
@@ -59,6 +60,8 @@ class AbstractMethod(nn.Module, ABC):
     """
 
     name: ClassVar[str]
+    networks: ClassVar[tuple[str, ...]] = ()
+    """Submodules whose forward passes may run in reduced precision or compiled (`precision`)."""
     config: Any
     """A frozen dataclass; stored in checkpoints."""
     category: Category
@@ -108,3 +111,15 @@ class AbstractMethod(nn.Module, ABC):
             mode: `fast`, networks only; `refine`, with search or optimisation at test time. A
                 method that knows one way alone takes it in both modes.
         """
+
+    def pictures(self, observation: Observation) -> dict[str, PictureData]:
+        """What training shows of its progress, by name: a template, reconstructions, nothing.
+
+        Called in eval mode without gradients, with the same few training clouds each time. It
+        must not change the method nor draw random numbers.
+
+        Args:
+            observation: A batch, camera frame, metres.
+        """
+        del observation
+        return {}

@@ -18,11 +18,13 @@ from tiny import TINY, tiny, tiny_data
 
 from scapo import fit
 from scapo.checkpoint import TRAINING, WEIGHTS, read_checkpoint
+from scapo.descent import cosine
 from scapo.files import read
 from scapo.layout import StoreError
 from scapo.method import Stage
+from scapo.run_folder import TIMING
 
-CONFIG = fit.FitConfig(log_every=2, checkpoint_every=0.0)
+CONFIG = fit.FitConfig(log_every=2, checkpoint_every=0.0, pictures_every=None)
 
 
 def run(folder: Path, *, resume: bool = False, config: fit.FitConfig = CONFIG) -> None:
@@ -149,7 +151,7 @@ def test_the_run_folder_says_what_was_run(whole: Path) -> None:
     assert [line["step"] for line in lines] == sorted({line["step"] for line in lines})
     terms = [value for name, value in lines[0].items() if name.startswith("loss/")]
     assert sum(terms) == pytest.approx(lines[0]["loss"], rel=1e-5)
-    timing = json.loads((whole / fit.TIMING).read_text())
+    timing = json.loads((whole / TIMING).read_text())
     assert timing["samples_per_second"].keys() == {"canonicalise", "articulate"}
 
 
@@ -174,9 +176,9 @@ def test_a_loss_that_is_not_finite_stops_and_saves_the_batch(tmp_path: Path) -> 
 
 def test_the_cosine_goes_from_lr_to_its_minimum() -> None:
     stage = Stage(name="s", epochs=1, lr=1e-3, min_lr=1e-6)
-    assert fit.cosine(stage, 0.0) == pytest.approx(1e-3)
-    assert fit.cosine(stage, 0.5) == pytest.approx((1e-3 + 1e-6) / 2)
-    assert fit.cosine(stage, 1.0) == pytest.approx(1e-6)
+    assert cosine(stage, 0.0) == pytest.approx(1e-3)
+    assert cosine(stage, 0.5) == pytest.approx((1e-3 + 1e-6) / 2)
+    assert cosine(stage, 1.0) == pytest.approx(1e-6)
 
 
 def test_frozen_groups_stay_until_they_begin(tmp_path: Path) -> None:
