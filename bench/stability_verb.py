@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,6 +31,7 @@ from scapo.store import Split, open_split, write_bytes
 from scapo.types import Observation
 
 FORMAT = "scapo-stability/1"
+TITLES = {"none": "not moved", "rotation": "turned", "translation": "shifted", "both": "both"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,8 +94,9 @@ class Stability:
         text = json.dumps(report, sort_keys=True, indent=1, allow_nan=False)
         write_bytes(self.out, (text + "\n").encode())
         for mode, found in measured.items():
-            title = f"{method.name} {header['category']} {self.split}, {mode}"
-            console.print(table(found, f"{title}, {len(points)} clouds"))
+            title = f"{method.name} {header['category']} {self.split}, {mode}, {len(points)} clouds"
+            for table in tables(found, f"{title}, {found['clouds_per_second']:.3g} a second"):
+                console.print(table)
         console.print(f"Report: {self.out}", soft_wrap=True)
 
 
@@ -153,29 +156,42 @@ def _report(
     }
 
 
-def table(found: dict[str, Any], title: str) -> Table:
-    """A row per quantity: median and 95th percentile with their intervals."""
-    out = Table("", "quantity", "median", "95 % interval", "p95", "95 % interval",
-                title=f"{title}, {found['clouds_per_second']:.3g} clouds/s")  # fmt: skip
-    groups = {f"moved: {kind}": rows for kind, rows in found["equivariance"].items()}
-    groups |= {"resampled": found["resampling"]} if "resampling" in found else {}
-    for group, rows in groups.items():
-        for number, (name, row) in enumerate(rows.items()):
-            cells = [text for key in ("median", "p95") for text in _cells(row.get(key))]
-            out.add_row("" if number else group, quantity(name), *cells)
-        out.add_section()
-    return out
+def tables(found: dict[str, Any], title: str) -> Iterator[Table]:
+    """Changes under motion, a column per kind, and scatter over resamplings."""
+    moved = found["equivariance"]
+    out = Table("change, median / p95", *(TITLES[kind] for kind in moved), title=title)
+    for name in moved["both"]:
+        out.add_row(quantity(name), *(_pair(rows[name]) for rows in moved.values()))
+    yield out
+    if "resampling" not in found:
+        return
+    rows = found["resampling"]
+    out = Table("scatter", "std, median", "MAD, median", "MAD, p95", title="resampled")
+    for name in dict.fromkeys(key.rsplit("_", 1)[0] for key in rows):
+        std, mad = rows[f"{name}_std"], rows[f"{name}_mad"]
+        out.add_row(quantity(name), _ranged(std, "median"), _ranged(mad, "median"),
+                    _ranged(mad, "p95"))  # fmt: skip
+    yield out
 
 
 def quantity(name: str) -> str:
-    """`axis_deg_std` as a reader takes it: axis, deg, std."""
-    words = name.split("_")
-    tail = 2 if words[-1] in ("std", "mad") else 1
-    head, rest = " ".join(words[:-tail]), [word for word in words[-tail:] if word != "1"]
-    return ", ".join([head, *rest])
+    """`base_rotation_deg` as a reader takes it: base rotation, deg."""
+    head, unit = name.replace("_", " ").rsplit(" ", 1)
+    return head if unit == "1" else f"{head}, {unit}"
 
 
-def _cells(row: dict[str, float] | None) -> tuple[str, str]:
-    if row is None:
-        return "–", "–"
-    return f"{row['value']:.3g}", f"{row['low']:.3g} to {row['high']:.3g}"
+def _number(value: float) -> str:
+    return "<1e-3" if 0 < value < 1e-3 else f"{value:.3g}"
+
+
+def _pair(row: dict[str, Any]) -> str:
+    if "median" not in row:
+        return "–"
+    return f"{_number(row['median']['value'])} / {_number(row['p95']['value'])}"
+
+
+def _ranged(row: dict[str, Any], key: str) -> str:
+    if key not in row:
+        return "–"
+    low, high = _number(row[key]["low"]), _number(row[key]["high"])
+    return f"{_number(row[key]['value'])} ({low} to {high})"

@@ -18,7 +18,7 @@ from bench.changes import changes, moved
 from bench.provenance import commit, provenance
 from bench.scatter import geometric_median, same_signs, scatter
 from bench.stability import MOTIONS, SHIFT, Plan, equivariance, random_motions, resampled, summary
-from bench.stability_verb import quantity, table
+from bench.stability_verb import quantity, tables
 from scapo.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 
 TURNS = np.array([True])
@@ -239,11 +239,12 @@ def test_the_command_writes_a_report_and_a_table(tmp_path, capsys) -> None:
     assert len(fast["resampling"]["pivot_r4_mad"]["per_sample"]) == 4
     assert "Report: " in capsys.readouterr().out
     console = Console(width=120, record=True)
-    console.print(table(fast, "tiny"))
+    for found in tables(fast, "tiny"):
+        console.print(found)
     printed = console.export_text()
-    for text in ("p95", "moved: both", "resampled", "pivot, r4, mad"):
+    for text in ("median / p95", "turned", "resampled", "pivot, r4", "MAD, p95"):
         assert text in printed
-    assert quantity("base_rotation_deg_std") == "base rotation, deg, std"
+    assert quantity("base_rotation_deg") == "base rotation, deg"
     assert quantity("labels_1") == "labels"
 
 
