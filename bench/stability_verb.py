@@ -18,7 +18,6 @@ from rich.table import Table
 
 from bench.methods import load
 from bench.predict import to_arrays
-from bench.provenance import provenance
 from bench.scores import Rows
 from bench.stability import SHIFT, Plan, Timed, equivariance, resampled, summary
 from bench.train import pick_device
@@ -27,6 +26,7 @@ from scapo.data import SampleDataset
 from scapo.discovery import evenly
 from scapo.files import Header
 from scapo.method import AbstractMethod, Mode
+from scapo.provenance import commit, machine
 from scapo.store import Split, open_split, write_bytes
 from scapo.types import Observation
 
@@ -89,7 +89,7 @@ class Stability:
             for mode in modes
         }  # fmt: skip
         report = _report(method, header, split, index, plan) | {
-            "modes": measured, **provenance(device),
+            "modes": measured, "commit": commit(), "machine": machine(device),
         }  # fmt: skip
         text = json.dumps(report, sort_keys=True, indent=1, allow_nan=False)
         write_bytes(self.out, (text + "\n").encode())
