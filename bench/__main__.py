@@ -3,7 +3,7 @@
 
 A verb is a frozen dataclass in `bench.verbs` (or beside its function) whose fields are the flags,
 with a method `run(console)`; `VERBS` lists them. Ends 0 on success, 1 on bad input or a failed
-job with one line, 2 on wrong usage.
+job with one line, 2 on wrong usage, 130 when interrupted.
 """
 
 from __future__ import annotations
@@ -46,9 +46,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         command.run(Console())
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
-        line = " ".join(str(error).split())
-        Console(stderr=True, soft_wrap=True).print(f"scapo-bench: {escape(line)}", highlight=False)
+        complain(" ".join(str(error).split()))
         sys.exit(1)
+    except KeyboardInterrupt as stop:
+        complain(str(stop) or "interrupted")
+        sys.exit(130)
+
+
+def complain(line: str) -> None:
+    """One line on standard error."""
+    Console(stderr=True, soft_wrap=True).print(f"scapo-bench: {escape(line)}", highlight=False)
 
 
 if __name__ == "__main__":

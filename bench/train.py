@@ -14,10 +14,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from bench.methods import METHODS
+from bench.run_report import REPORT, write_report
 from scapo import fit
 from scapo.categories import category
 from scapo.checkpoint import WEIGHTS
+from scapo.precision import Arithmetic, Precision
+from scapo.ranks import joined, own_device
 from scapo.resident import read_training_data
+from scapo.run_folder import kept
 from scapo.store import open_split
 
 M = TypeVar("M")
@@ -46,8 +50,31 @@ class Train(Generic[M]):
     """Steps between two lines of metrics.jsonl."""
     checkpoint_every: float = 60.0
     """Seconds after which the end of an epoch saves the state."""
+    precision: Precision = "float32"
+    """Of the networks' matrix products; geometry and losses stay float32."""
+    compile: bool = False
+    """Compile the networks, on CUDA with CUDA graphs."""
+    tf32: bool = True
+    """On CUDA, float32 matrix products of networks with 10-bit mantissas."""
+    pictures_every: float = 300.0
+    """Seconds after which the end of an epoch draws pictures, as does the end of a stage."""
+    pictures: bool = True
+    """Draw pictures at all."""
 
     def run(self, console: Console) -> None:
+        """Fit the method, one process or as one of torchrun's, and write the report."""
+        device = own_device(pick_device(self.device))
+        try:
+            with joined(device) as ranks:
+                self._fit(device, console if ranks.first else Console(quiet=True))
+                if ranks.first:
+                    write_report(self.out)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(f"{self.out}: interrupted; {kept(self.out)}") from stop
+        if ranks.first:
+            console.print(f"Run: {self.out / WEIGHTS}, {self.out / REPORT}", soft_wrap=True)
+
+    def _fit(self, device: str, console: Console) -> None:
         """Read the split, build the method, fit it with a progress bar."""
         name = next(name for name, entry in METHODS.items() if isinstance(self.method, entry.kind))
         kind = category(self.category)
@@ -56,9 +83,11 @@ class Train(Generic[M]):
         method = METHODS[name].build(self.method, kind, generator)
         config = fit.FitConfig(
             seed=self.seed,
-            device=pick_device(self.device),
+            device=device,
             log_every=self.log_every,
             checkpoint_every=self.checkpoint_every,
+            arithmetic=Arithmetic(precision=self.precision, compiled=self.compile, tf32=self.tf32),
+            pictures_every=self.pictures_every if self.pictures else None,
         )
         size = sum(parameter.numel() for parameter in method.parameters())
         console.print(
@@ -68,7 +97,6 @@ class Train(Generic[M]):
         data = read_training_data(split)
         with _bars(console) as progress:
             fit.fit(method, data, self.out, config, resume=self.resume, listener=_Bar(progress))
-        console.print(f"Run: {self.out / WEIGHTS}", soft_wrap=True)
 
 
 def train_verb(preset: str | None) -> Any:  # noqa: ANN401 - a type made at run time

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from scapo.exact import at_least_float32
 from scapo.types import Category, JointKind
 from scapo.vector_neurons import uniform
 
@@ -114,7 +115,9 @@ class JointNetwork(nn.Module):
             x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
         pooled = self.blocks[-1](x).amax(1)
         pivot, axis, state = (
-            self.head(pooled).unflatten(1, (len(self.kinds), 8)).split((3, 3, 2), -1)
+            at_least_float32(self.head(pooled))
+            .unflatten(1, (len(self.kinds), 8))
+            .split((3, 3, 2), -1)
         )
         reach = {"revolute": self.config.revolute_range, "prismatic": self.config.prismatic_range}
         scale = state.new_tensor([reach[kind] for kind in self.kinds])[:, None]

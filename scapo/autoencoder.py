@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from scapo.exact import exact
 from scapo.geometry import project_rotation
 from scapo.points import gather
 from scapo.vector_neurons import (
@@ -156,7 +157,9 @@ class Encoder(nn.Module):
 
     def project(self, frame: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
         """The rotation that is used wherever one is needed; `frame` itself feeds L_ortho alone."""
-        return project_rotation(frame) if self.config.projection == "svd" else gram_schmidt(frame)
+        with exact(frame.device.type):
+            svd = self.config.projection == "svd"
+            return project_rotation(frame) if svd else gram_schmidt(frame)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -34,7 +34,7 @@ from scapo.precision import Arithmetic
 from scapo.progress_pictures import draw_progress
 from scapo.ranks import average_buffers, present
 from scapo.resident import TrainingData
-from scapo.run_folder import Position, RunFolder, State
+from scapo.run_folder import Position, RunFolder, State, kept
 
 
 class TrainingError(ArithmeticError):
@@ -174,13 +174,8 @@ class Trainer:
         except OSError as error:
             raise StoreError(
                 f"{self.folder.path}: expected a folder that can be written, found "
-                f"{error.strerror or error}; {self.kept()}"
+                f"{error.strerror or error}; {kept(self.folder.path)}"
             ) from error
-
-    def kept(self) -> str:
-        """What an interrupted run leaves, in words."""
-        step = self.folder.saved_step()
-        return "nothing was saved yet" if step is None else f"resume continues after step {step}"
 
     def _stages(self, moments: Arrays | None) -> None:
         position, stages = self.state.position, self.method.stages()

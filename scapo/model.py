@@ -99,6 +99,7 @@ class Scapo(AbstractMethod):
     """The method, for one category."""
 
     name: ClassVar[str] = "scapo"
+    networks = ("encoder", "decoder", "joint_network", "keypoint_network", "residual_network")
 
     def __init__(self, config: ScapoConfig, category: Category, generator: torch.Generator) -> None:
         """Build the networks and draw their weights.

@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from scapo.exact import exact
+
 
 @torch.no_grad()
 def nearest(
@@ -79,8 +81,7 @@ def _products(
     on_cpu = left.device.type == "cpu"
     block = BLOCK if on_cpu else 128 * BLOCK
     clouds, rows = max(1, block // max(1, n * m)), max(1, block // m)
-    # Autocast would multiply in half precision and find the wrong neighbours.
-    with torch.autocast(left.device.type, enabled=False):
+    with exact(left.device.type):  # fewer digits would find the wrong neighbours
         for some, others in zip(left.split(clouds), right.split(clouds), strict=True):
             for part in some.split(rows, dim=1):
                 yield _numpy_product(part, others) if on_cpu else part @ others

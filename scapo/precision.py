@@ -15,6 +15,7 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
+from scapo.exact import at_least_float32, matrix_products
 from scapo.method import AbstractMethod
 
 Precision = Literal["float32", "bfloat16", "float16"]
@@ -95,21 +96,10 @@ def _with_tf32(forward: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-@contextmanager
-def matrix_products(precision: Literal["highest", "high"]) -> Iterator[None]:
-    """Torch's setting for float32 matrix products, for the time of the block."""
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision(precision)
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
-
-
 def full(value: Any) -> Any:  # noqa: ANN401
     """Tensors, and tuples and dataclasses of them, in float32 where they were in half."""
     if isinstance(value, Tensor):
-        return value.float() if value.dtype in (torch.float16, torch.bfloat16) else value
+        return at_least_float32(value) if value.is_floating_point() else value
     if isinstance(value, tuple):
         return tuple(full(item) for item in value)
     if is_dataclass(value) and not isinstance(value, type):

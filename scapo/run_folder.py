@@ -69,6 +69,7 @@ class RunFolder:
         extra: dict[str, Any] = {
             **self.about,
             "supervision": sorted(self.method.supervision),
+            "parameters": sum(item.numel() for item in self.method.parameters()),
             "steps": position.step,
             "finished": finished,
             "commit": provenance.commit(),
@@ -93,14 +94,6 @@ class RunFolder:
         if there and not resume:
             raise StoreError(f"{self.path}: expected no run there, found one; resume continues it")
         return there
-
-    def saved_step(self) -> int | None:
-        """The step of the state that is there, None without any."""
-        path = self.path / checkpoint.TRAINING
-        try:
-            return read_header(path, checkpoint.TRAINING_FORMAT)["position"]["step"]
-        except (StoreError, OSError):
-            return None
 
     def load(self, state: State, rank: int = 0) -> tuple[bool, Arrays | None]:
         """Load the method and `state`; whether the run is finished, and Adam's part of it.
@@ -167,3 +160,13 @@ class RunFolder:
 def noise_name(rank: int) -> str:
     """Where the generator of a rank is kept."""
     return f"generator/noise/{rank}" if rank else "generator/noise"
+
+
+def kept(run: Path) -> str:
+    """What an interrupted run leaves in its folder, in words."""
+    path = run / checkpoint.TRAINING
+    try:
+        step = read_header(path, checkpoint.TRAINING_FORMAT)["position"]["step"]
+    except (StoreError, OSError):
+        return "nothing was saved yet"
+    return f"saved after step {step}, resume continues from there"

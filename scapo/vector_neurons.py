@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from scapo.exact import at_least_float32
 from scapo.points import farthest_points, gather, k_nearest
 
 EdgeForm = Literal["point", "mean"]
@@ -124,7 +125,7 @@ class VNLinear(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B 3 I"]) -> Float[Tensor, "*B 3 O"]:
         """(..., 3, inputs) -> (..., 3, outputs)."""
-        return F.linear(x, self.rows())
+        return at_least_float32(F.linear(x, self.rows()))
 
 
 class VectorScale(nn.Module):

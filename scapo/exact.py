@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: MIT
+"""Full float32 where the surroundings may compute with fewer digits: rotations, neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+
+@contextmanager
+def exact(kind: str) -> Iterator[None]:
+    """Neither autocast nor TF32 on a device of that kind, for the time of the block."""
+    with torch.autocast(kind, enabled=False):
+        if kind != "cuda":
+            yield
+            return
+        with matrix_products("highest"):
+            yield
+
+
+@contextmanager
+def matrix_products(precision: Literal["highest", "high"]) -> Iterator[None]:
+    """Torch's setting for float32 matrix products, for the time of the block."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def at_least_float32(tensor: Tensor) -> Tensor:
+    """The same numbers, in float32 where they were in half precision.
+
+    >>> at_least_float32(torch.zeros(1, dtype=torch.bfloat16)).dtype
+    torch.float32
+    """
+    return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
