@@ -168,14 +168,9 @@ def _driver_remedy() -> str:
 
 
 def _maniskill() -> Renderer:
-    version = _version("mani-skill")
-    if version is None:
-        return _broken("maniskill", "not installed (many scenes at once, on a CUDA GPU)")
-    import torch
-
-    cuda = torch.cuda.is_available()
-    detail = f"ManiSkill {version}, " + (torch.cuda.get_device_name() if cuda else "no CUDA GPU")
-    return Renderer(name="maniskill", works=cuda, detail=detail, remedy="")
+    if find_spec("mani_skill") is None:
+        return _broken("maniskill", "not installed (many objects at once, for a CUDA GPU)")
+    return probe("maniskill")
 
 
 def _version(package: str) -> str | None:

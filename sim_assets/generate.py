@@ -19,6 +19,7 @@ from scapo.manifest import Manifest, Shard, shards_digest
 from sim_assets.assets import Asset
 from sim_assets.card import CARD, write_card
 from sim_assets.ledger import GenerateError, Ledger
+from sim_assets.pieces import TOGETHER
 from sim_assets.plan import (
     Entry,
     Request,
@@ -224,6 +225,8 @@ def _render(
 def _without(outcome: Outcome[ShardJob, ShardDone], strict: bool) -> ShardJob:
     """The job again, without the object at which its worker died or hung."""
     job = outcome.job
+    if outcome.label == TOGETHER and outcome.failure != "error" and not job.apart:
+        return replace(job, apart=True)  # to see which of them it is
     if outcome.failure == "error" and not strict:  # of writing: objects are left out in the job
         raise GenerateError(outcome.reason)
     if strict or not outcome.label or outcome.label in job.skip:

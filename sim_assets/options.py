@@ -50,8 +50,9 @@ class DataOptions:
     mask: Mask = "exact"
     """Which pixels are taken for the object. imperfect: an outline with errors, missing pieces,
     and foreign points (part 255)."""
-    backend: Literal["auto", "sapien", "raycast"] = "auto"
-    """Renderer; auto: SAPIEN where a Vulkan device is found, else ray casting."""
+    backend: Literal["auto", "sapien", "raycast", "maniskill"] = "auto"
+    """Renderer; auto: SAPIEN where a Vulkan device is found, else ray casting. maniskill: many
+    objects at once, for CUDA GPUs."""
     image_size: int | None = None
     """Width and height in pixels; default: the preset's, 256 for sim-art, whose field of view is 60
     degrees."""

@@ -74,12 +74,15 @@ def cube() -> ArticulatedObject:
 
 
 def _device(backend: Backend) -> str:
-    if backend != "sapien":
+    if backend == "raycast":
         return f"CPU, embreex {metadata.version('embreex')}"
     from sim_assets.scene import versions
 
     found = versions()
-    return f"{found['device']}, SAPIEN {found['sapien']}"
+    device = f"{found['device']}, SAPIEN {found['sapien']}"
+    if backend == "sapien":
+        return device
+    return f"{device}, ManiSkill {metadata.version('mani-skill')}"
 
 
 def main(backend: str) -> None:

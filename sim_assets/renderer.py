@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
 """What a renderer is: an object and a camera in, depth and part indices out.
 
-Two backends answer to it: `scene` (SAPIEN) and `raycast` (Embree). Both send one ray through the
-centre of each pixel and see both sides of every surface, so their pictures agree (a test compares
-them).
+Three backends answer to it: `scene` (SAPIEN), `raycast` (Embree) and `parallel_scene` (ManiSkill,
+many objects at once). All send one ray through the centre of each pixel and see both sides of every
+surface, so their pictures agree (tests compare them).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
@@ -20,7 +20,9 @@ from jaxtyping import Float, UInt8
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject, Visual
 
-Backend = Literal["sapien", "raycast"]
+Backend = Literal["sapien", "raycast", "maniskill"]
+AUTO: tuple[Backend, ...] = ("sapien", "raycast")
+"""What `auto` tries, in this order; many objects at once pay on a GPU only, and are asked for."""
 BACKGROUND = 255
 """Part index of a pixel that shows no object."""
 
@@ -79,17 +81,46 @@ class AbstractRenderer(ABC):
         self.close()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ask:
+    """A picture asked for: the arguments of `AbstractRenderer.render`."""
+
+    state: Float[np.ndarray, " J"]
+    camera_T_object: Float[np.ndarray, "4 4"]
+    camera: Intrinsics
+    only: int | None = None
+
+
+class AbstractParallelRenderer(AbstractRenderer):
+    """Shows several objects at once, each in a place of its own."""
+
+    places: int
+    """How many it shows at once with profit."""
+
+    @abstractmethod
+    def open_all(self, things: Sequence[ArticulatedObject]) -> None:
+        """Show one object in each place from now on; the same one may be in several."""
+
+    @abstractmethod
+    def render_all(self, asks: Sequence[Ask | None]) -> list[Frame | None]:
+        """A picture for each place that asks for one; all with the same intrinsics.
+
+        Raises:
+            RenderError: The device failed.
+        """
+
+
 def resolve_backend(name: str) -> Backend:
-    """The backend that `auto`, `sapien` or `raycast` means on this machine.
+    """The backend that `auto` or a backend's name means on this machine.
 
     Raises:
         RenderError: That backend does not work here, and why.
     """
-    if name != "auto" and name not in get_args(Backend):
-        raise RenderError(f"backend: expected auto, sapien or raycast, found {name!r}")
-    why = {}
     known: tuple[Backend, ...] = get_args(Backend)
-    for backend in known:
+    if name != "auto" and name not in known:
+        raise RenderError(f"backend: expected auto or one of {', '.join(known)}, found {name!r}")
+    why = {}
+    for backend in AUTO if name == "auto" else known:
         if name in ("auto", backend):
             why[backend] = _CHECK[backend]()
             if why[backend] is None:
@@ -111,6 +142,10 @@ def make_renderer(backend: Backend, *, color: bool = False) -> AbstractRenderer:
         from sim_assets.scene import SapienRenderer
 
         return SapienRenderer(color=color)
+    if backend == "maniskill":
+        from sim_assets.parallel_scene import ManiSkillRenderer
+
+        return ManiSkillRenderer(color=color)
     from sim_assets.raycast import RaycastRenderer
 
     return RaycastRenderer(color=color)
@@ -132,9 +167,16 @@ def _raycast_missing() -> str | None:
     return None if find_spec("embreex") else "the package embreex is not installed"
 
 
+def _maniskill_missing() -> str | None:
+    if find_spec("mani_skill") is None:
+        return "the package mani_skill is not installed (pip install 'scapo[gpu-sim]')"
+    return _sapien_missing()
+
+
 _CHECK: dict[str, Callable[[], str | None]] = {
     "sapien": _sapien_missing,
     "raycast": _raycast_missing,
+    "maniskill": _maniskill_missing,
 }
 
 

@@ -61,6 +61,10 @@ def versions(backend: Backend | None, protocol: Protocol) -> dict[str, str]:
         from sim_assets import scene
 
         drawn = scene.versions()
+    elif protocol != "full" and backend == "maniskill":
+        from sim_assets import parallel_scene
+
+        drawn = parallel_scene.versions()
     return {**{name: metadata.version(name) for name in names}, **drawn}
 
 

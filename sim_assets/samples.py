@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,11 +17,16 @@ from sim_assets.noise import Sensor, measure_some
 from sim_assets.options import Mask, Noise, Preset, Protocol, Sampling
 from sim_assets.preset_views import Wanted, draw_preset_views
 from sim_assets.presets import least_points
-from sim_assets.renderer import AbstractRenderer, Backend, Frame
+from sim_assets.renderer import AbstractRenderer, Ask, Backend, Frame, RenderError
 from sim_assets.views import Outline, View, generator
 
 Row = dict[str, np.ndarray]
 """One sample: the tensors of CONTRACT 3 without their first dimension."""
+
+Done = TypeVar("Done")
+Steps = Generator[list[Ask], list[Frame], Done]
+"""Yields the pictures that it needs next and is sent them; so that whoever has a renderer may take
+those of several objects at once."""
 
 LEAST_PIXELS = 200
 """Visible pixels below which a view is drawn again (CONTRACT 3)."""
@@ -78,7 +84,7 @@ class Shooter:
     def __init__(
         self, renderer: AbstractRenderer | None, thing: ArticulatedObject, settings: Settings
     ) -> None:
-        """Open the object in the renderer, if there is one."""
+        """Open the object in the renderer, if there is one; `steps` does without."""
         self.renderer, self.thing, self.settings = renderer, thing, settings
         self.outline = Outline(thing)
         self.surface = Surface(thing)
@@ -100,10 +106,28 @@ class Shooter:
             ViewError: No draw of a view was good.
         """
         for start in range(0, len(keys), BATCH):
-            yield from self._shoot(keys[start : start + BATCH])
+            yield from self._follow(self.steps(keys[start : start + BATCH]))
 
-    def _shoot(self, keys: Sequence[tuple[object, ...]]) -> list[Shot]:
-        """Draw all, then again those that are poor, until none is."""
+    def _follow(self, steps: Steps[list[Shot]]) -> list[Shot]:
+        """Do the steps with the renderer."""
+        try:
+            asks = next(steps)
+            while True:
+                asks = steps.send([self._render(ask) for ask in asks])
+        except StopIteration as end:
+            return end.value
+
+    def _render(self, ask: Ask) -> Frame:
+        if self.renderer is None:
+            raise RenderError("expected a renderer, found none")
+        return self.renderer.render(ask.state, ask.camera_T_object, ask.camera, ask.only)
+
+    def steps(self, keys: Sequence[tuple[object, ...]]) -> Steps[list[Shot]]:
+        """As `shots`, for at most BATCH keys: draw all, then again those that are poor.
+
+        Raises:
+            ViewError: No draw of a view was good.
+        """
         shots: dict[int, Shot] = {}
         plans: list[bytes] = []
         for draws in range(1, MAX_DRAWS + 1):
@@ -112,7 +136,7 @@ class Shooter:
             views = draw_preset_views(self.outline, rngs, self.wanted)
             plans = plans or [_plan_bytes(view) for view in views]
             for k, rng, view in zip(poor, rngs, views, strict=True):
-                rows = self._rows(view, rng)
+                rows = yield from self._rows(view, rng)
                 if rows is not None:
                     shots[k] = Shot(rows=rows, draws=draws, plan=plans[k])
             if len(shots) == len(keys):
@@ -123,26 +147,26 @@ class Shooter:
             f"{MAX_DRAWS} draws"
         )
 
-    def _rows(self, view: View, rng: np.random.Generator) -> list[Row] | None:
+    def _rows(self, view: View, rng: np.random.Generator) -> Steps[list[Row] | None]:
         """Samples of all states, or None if one of them shows too little."""
         rows = []
         for state in view.states:
-            row = self._row(state, view, rng)
+            row = yield from self._row(state, view, rng)
             if row is None:
                 return None
             rows.append(row)
         return rows
 
-    def _row(self, state: np.ndarray, view: View, rng: np.random.Generator) -> Row | None:
+    def _row(self, state: np.ndarray, view: View, rng: np.random.Generator) -> Steps[Row | None]:
         settings = self.settings
         known = truth(self.thing, state, view.camera_T_object)
-        if self.renderer is None:
+        if settings.protocol == "full":
             visible = np.ones(len(known.camera_T_part))
             cloud = self.surface.sample(
                 known.camera_T_part, settings.points, self.least, rng, settings.sampling
             )
         else:
-            frames = self._frames(self.renderer, state, view)
+            frames = yield self._asks(state, view)
             sensed = measure_some(frames, settings.camera, rng, self.sensor, self.enough)
             seen = visible_pixels(sensed)
             if sum(len(pixels) for pixels in seen) < LEAST_PIXELS:
@@ -169,12 +193,18 @@ class Shooter:
         per_part = np.bincount(cloud.part, minlength=parts)[:parts]
         return bool((per_part >= np.maximum(self.least, self.asked)).all())
 
-    def _frames(self, renderer: AbstractRenderer, state: np.ndarray, view: View) -> list[Frame]:
-        camera = self.settings.camera
-        if self.settings.protocol == "joint":
-            return [renderer.render(state, view.camera_T_object, camera)]
+    def _asks(self, state: np.ndarray, view: View) -> list[Ask]:
+        """The pictures of a sample: of the whole object, or of each part alone."""
         parts = range(len(self.thing.visuals))
-        return [renderer.render(state, view.camera_T_object, camera, part) for part in parts]
+        return [
+            Ask(
+                state=state,
+                camera_T_object=view.camera_T_object,
+                camera=self.settings.camera,
+                only=only,
+            )
+            for only in ((None,) if self.settings.protocol == "joint" else parts)
+        ]
 
 
 def _cloud_row(cloud: Cloud, color: bool) -> Row:

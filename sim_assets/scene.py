@@ -125,7 +125,7 @@ class _Stage:
         if ids != list(range(1, len(ids) + 1)):
             raise RenderError(f"expected entities numbered 1, 2, ..., found {ids}")
         self.hidden: frozenset[int] = frozenset()
-        self.reach = _reach(thing)
+        self.reach = find_reach(thing)
         self.size = (0, 0)
         self.eye = sapien.Entity()
         self.camera: Any = None
@@ -146,15 +146,8 @@ class _Stage:
     def aim(self, camera_T_object: Float[np.ndarray, "4 4"], camera: Intrinsics) -> None:
         if self.size != (camera.width, camera.height):
             self._make_camera(camera)
-        turn, shift = camera_T_object[:3, :3].T, camera_T_object[:3, 3]
-        object_T_robot = np.eye(4)
-        object_T_robot[:3, :3] = turn @ CAMERA_T_ROBOT
-        object_T_robot[:3, 3] = -turn @ shift
-        self.eye.set_pose(sapien.Pose(object_T_robot))
-        # A tight depth range keeps surfaces a fraction of a millimetre apart in order.
-        distance = math.hypot(*shift)
-        near = max(distance - 1.1 * self.reach, 0.02 * distance, 1e-4)
-        far = distance + 1.1 * self.reach
+        self.eye.set_pose(camera_pose(camera_T_object))
+        near, far = depth_range(camera_T_object, self.reach)
         self.camera.set_perspective_parameters(
             near, far, camera.fx, camera.fy, camera.cx, camera.cy, 0.0
         )
@@ -183,26 +176,45 @@ class _Stage:
         self.scene.add_entity(self.eye)
 
 
+def camera_pose(camera_T_object: Float[np.ndarray, "4 4"]) -> sapien.Pose:
+    """Of SAPIEN's camera (x forward, y left, z up) in the object frame."""
+    turn, shift = camera_T_object[:3, :3].T, camera_T_object[:3, 3]
+    object_T_robot = np.eye(4)
+    object_T_robot[:3, :3] = turn @ CAMERA_T_ROBOT
+    object_T_robot[:3, 3] = -turn @ shift
+    return sapien.Pose(object_T_robot)
+
+
+def depth_range(camera_T_object: Float[np.ndarray, "4 4"], reach: float) -> tuple[float, float]:
+    """Near and far, m: tight, which keeps surfaces a fraction of a millimetre apart in order."""
+    distance = math.hypot(*camera_T_object[:3, 3])
+    return max(distance - 1.1 * reach, 0.02 * distance, 1e-4), distance + 1.1 * reach
+
+
 def _part(entity: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
     """Parts are entities 1, 2, ...; 0, where there is none, becomes 255."""
     return entity - np.uint8(1)
 
 
 def _entity(visuals: tuple[Visual, ...], color: bool) -> sapien.Entity:
-    """A part: a shape per colour, or one for all, which is one draw call."""
+    """A part as one entity."""
     body = RenderBodyComponent()
-    closed = _closed(visuals)
-    if color:
-        for visual in visuals:
-            body.attach(_shape([visual], closed, visual.color))
-    else:
-        body.attach(_shape(visuals, closed))
+    for shape in make_shapes(visuals, color):
+        body.attach(shape)
     entity = sapien.Entity()
     entity.add_component(body)
     return entity
 
 
-def _reach(thing: ArticulatedObject) -> float:
+def make_shapes(visuals: tuple[Visual, ...], color: bool) -> list[RenderShapeTriangleMesh]:
+    """A part's surfaces: a shape per colour, or one for all, which is one draw call."""
+    closed = _closed(visuals)
+    if color:
+        return [_shape([visual], closed, visual.color) for visual in visuals]
+    return [_shape(visuals, closed)]
+
+
+def find_reach(thing: ArticulatedObject) -> float:
     """Radius about the object's origin that no point of it leaves at any state, m."""
     radius = np.zeros(len(thing.visuals))
     for part, visuals in enumerate(thing.visuals):

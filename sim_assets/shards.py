@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -16,13 +16,16 @@ import numpy as np
 from scapo.jobs import Report, describe_error
 from scapo.store import SAMPLES, read_header, write
 from sim_assets.assets import Asset
+from sim_assets.pieces import shoot_piece, shoot_pieces
 from sim_assets.plan import Entry, Piece, Request, ShardPlan, instance_record
-from sim_assets.renderer import AbstractRenderer, Backend, make_renderer
+from sim_assets.renderer import (
+    AbstractParallelRenderer,
+    AbstractRenderer,
+    Backend,
+    make_renderer,
+)
 from sim_assets.request import versions
-from sim_assets.samples import Row, Shooter, Shot, geometry_digest
-
-REPORT_EVERY = 8
-"""Views."""
+from sim_assets.samples import Row, Shot, geometry_digest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,6 +41,8 @@ class ShardJob:
     """Fail at the first object that fails."""
     skip: Mapping[str, str] = field(default_factory=dict)
     """Instance -> reason: objects that killed or hung a worker before."""
+    apart: bool = False
+    """One object at a time, where the renderer shows several: one of them killed a worker."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,20 +75,17 @@ def render_shard(job: ShardJob, report: Report) -> ShardDone:
     rows: list[Row] = []
     shots: list[Shot] = []
     failed: dict[str, str] = {}
-    for piece in job.plan.pieces:
-        name = piece.entry.instance.id
-        try:
-            if name in job.skip:
-                raise RuntimeError(job.skip[name])
-            taken, made = render_piece(job.request, piece, report)
-        except Exception as error:
+    for piece, result in _results(job, report):
+        if isinstance(result, Exception):
+            name = piece.entry.instance.id
             if job.strict:
-                raise
-            failed[name] = describe_error(error)
+                raise result
+            failed[name] = describe_error(result)
             report(name, piece.views * job.request.settings.states_per_view)
             continue
-        shots += taken
-        rows += made
+        shots += result
+        index = np.array(piece.index, np.int32)
+        rows += [{**row, "instance": index} for shot in result for row in shot.rows]
     return _write(job, rows, shots, failed)
 
 
@@ -108,33 +110,32 @@ def render_shard_alike(job: ShardJob, report: Report) -> ShardDone:
 _versions = lru_cache(maxsize=4)(versions)
 
 
-def render_piece(request: Request, piece: Piece, report: Report) -> tuple[list[Shot], list[Row]]:
-    """Samples of one object, with the instance index added.
+def _results(job: ShardJob, report: Report) -> Iterator[tuple[Piece, list[Shot] | Exception]]:
+    """What became of each object of the shard, in order."""
+    settings = job.request.settings
+    renderer = _renderer(settings.backend, settings.color)
+    made: Mapping[int, list[Shot] | Exception] = {}
+    if isinstance(renderer, AbstractParallelRenderer) and not job.apart:
+        wanted = [p for p in job.plan.pieces if p.entry.instance.id not in job.skip]
+        made = shoot_pieces(job.request, wanted, renderer, report)
+    for piece in job.plan.pieces:
+        if piece.entry.instance.id in job.skip:
+            yield piece, RuntimeError(job.skip[piece.entry.instance.id])
+        elif piece.index in made:
+            yield piece, made[piece.index]
+        else:
+            yield piece, _try_piece(job.request, piece, renderer, report)
 
-    Raises:
-        ValueError: The object is no longer the one that was planned.
-        ViewError: It cannot be shown as asked.
-        RenderError: The renderer failed.
-    """
-    name = piece.entry.instance.id
-    report(name, 0)
-    thing = piece.entry.asset.load()
-    if thing.origin.sha256 != piece.entry.instance.sha256:
-        raise ValueError(
-            f"{name}: expected files with sha256 {piece.entry.instance.sha256}, found "
-            f"{thing.origin.sha256}: they have changed since this data set was begun"
-        )
-    settings = request.settings
-    shooter = Shooter(_renderer(settings.backend, settings.color), thing, settings)
-    keys = [request.key(view) for view in range(piece.first, piece.first + piece.views)]
-    shots, told = [], 0
-    for shot in shooter.shots(keys):
-        shots.append(shot)
-        if len(shots) - told >= REPORT_EVERY or len(shots) == piece.views:
-            report(name, (len(shots) - told) * settings.states_per_view)
-            told = len(shots)
-    index = np.array(piece.index, np.int32)
-    return shots, [{**row, "instance": index} for shot in shots for row in shot.rows]
+
+def _try_piece(
+    request: Request, piece: Piece, renderer: AbstractRenderer | None, report: Report
+) -> list[Shot] | Exception:
+    try:
+        if isinstance(renderer, AbstractParallelRenderer):
+            return shoot_pieces(request, [piece], renderer, report)[piece.index]
+        return shoot_piece(request, piece, renderer, report)
+    except Exception as error:  # noqa: BLE001 - whatever it is, it costs this object only
+        return error
 
 
 @lru_cache(maxsize=1)

@@ -94,6 +94,16 @@ def test_auto_is_the_first_that_works(works: tuple[bool, bool], backend: str | N
     assert (f"auto` is {backend} here" in text_of(found)) == (backend is not None)
 
 
+def test_maniskill_is_tried_only_where_it_is_installed(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(doctor, "probe", renderer)
+    monkeypatch.setattr(doctor, "find_spec", lambda name: name)
+    assert doctor._maniskill().works
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None)
+    found = doctor._maniskill()
+    assert not found.works
+    assert "not installed" in found.detail
+
+
 def test_maniskill_is_never_chosen_by_itself():
     assert report(renderer("sapien", False), renderer("maniskill")).backend is None
 

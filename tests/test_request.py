@@ -12,6 +12,8 @@ from sim_assets import shards
 from sim_assets.generate import Running, generate
 from sim_assets.ledger import GenerateError
 from sim_assets.options import DataOptions
+from sim_assets.pieces import shoot_piece
+from sim_assets.plan import Piece
 from sim_assets.request import make_request
 from sim_assets.stream import stream
 
@@ -67,8 +69,8 @@ def test_a_model_that_has_changed_since_the_plan_is_refused():
     request, (asset, *_) = make_request("laptop", FULL)
     entry = shards.describe(asset, lambda label, amount: None)
     other = replace(entry, instance=replace(entry.instance, sha256="f" * 64))
-    piece = shards.Piece(entry=other, index=0, first=0, views=1)
+    piece = Piece(entry=other, index=0, first=0, views=1)
     with pytest.raises(ValueError, match="they have changed since this data set was begun"):
-        shards.render_piece(request, piece, lambda label, amount: None)
-    _, rows = shards.render_piece(request, replace(piece, entry=entry), lambda label, amount: None)
-    assert len(rows) == 1
+        shoot_piece(request, piece, None, lambda label, amount: None)
+    shots = shoot_piece(request, replace(piece, entry=entry), None, lambda label, amount: None)
+    assert len(shots) == 1

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,25 @@ def test_clouds_against_a_bare_loop(category: str, benchmark: BenchmarkFixture) 
         f"ratio {found[0]['ratio']:.2f}"
     )
     assert found[0]["ratio"] >= SHARE
+
+
+def test_many_objects_at_once() -> None:
+    """The sweep over objects per batch; quick on the CPU, where it only has to run."""
+    if find_spec("mani_skill") is None:
+        pytest.skip("the package mani_skill (extra [gpu-sim]) is absent")
+    script = str(Path(__file__).with_name("many.py"))
+    command = [sys.executable, "-W", "ignore", script, "drawer"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    print(f"\n{lines[0]['device']}")  # noqa: T201
+    for line in lines:
+        print(  # noqa: T201
+            f"{line['places']:5d} at once: {line['clouds']:.0f} clouds/s, "
+            f"{line['pictures']:.0f} pictures/s"
+        )
+    assert len(lines) >= 3
+    assert all(line["clouds"] > 0 for line in lines)
 
 
 def test_memory_stays_flat() -> None:
