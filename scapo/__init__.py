@@ -22,8 +22,9 @@ its origin at the centre of the bounding box at rest; a part's frame is the obje
 carried along by the part. `a_T_b` maps coordinates in b to a; points are rows.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from scapo.categories import CATEGORIES, category
-from scapo.predictor import load
 from scapo.types import (
     Category,
     Joints,
@@ -34,6 +35,9 @@ from scapo.types import (
     Sample,
     SampleKey,
 )
+
+if TYPE_CHECKING:
+    from scapo.predictor import load
 
 __all__ = [
     "CATEGORIES",
@@ -48,3 +52,12 @@ __all__ = [
     "category",
     "load",
 ]
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401
+    """`load` when it is asked for: the networks take two seconds to import, and data needs none."""
+    if name == "load":
+        from scapo.predictor import load
+
+        return load
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

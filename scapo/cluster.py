@@ -112,9 +112,7 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for attempt in self._running:
-            self._ray.cancel(attempt.stream, force=True)
-        self._running = []
+        self._cancel()
         if self._ours:
             self._ray.shutdown()
 
@@ -127,23 +125,31 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
         """See `AbstractPool.run`; the amounts of a lost attempt are reported back as negative."""
         waiting = deque(_Attempt(job=job) for job in jobs)
         task = _task(self._ray)
-        while waiting or self._running:
-            while waiting and len(self._running) < self._slots():
-                attempt = waiting.popleft()
-                attempt.stream = task.remote(function, attempt.job, self.timeout)
-                self._running.append(attempt)
-            streams = [attempt.stream for attempt in self._running]
-            ready, _ = self._ray.wait(
-                streams, num_returns=len(streams), timeout=TICK, fetch_local=False
-            )
-            for attempt in [a for a in self._running if any(a.stream is r for r in ready)]:
-                outcome = self._listen(attempt, on_report)
-                if outcome is not None:
-                    self._running.remove(attempt)
-                    yield outcome
-                elif attempt.stream is None:  # lost
-                    self._running.remove(attempt)
-                    waiting.appendleft(attempt)
+        try:
+            while waiting or self._running:
+                while waiting and len(self._running) < self._slots():
+                    attempt = waiting.popleft()
+                    attempt.stream = task.remote(function, attempt.job, self.timeout)
+                    self._running.append(attempt)
+                streams = [attempt.stream for attempt in self._running]
+                ready, _ = self._ray.wait(
+                    streams, num_returns=len(streams), timeout=TICK, fetch_local=False
+                )
+                for attempt in [a for a in self._running if any(a.stream is r for r in ready)]:
+                    outcome = self._listen(attempt, on_report)
+                    if outcome is not None:
+                        self._running.remove(attempt)
+                        yield outcome
+                    elif attempt.stream is None:  # lost
+                        self._running.remove(attempt)
+                        waiting.appendleft(attempt)
+        finally:  # left before the end
+            self._cancel()
+
+    def _cancel(self) -> None:
+        for attempt in self._running:
+            self._ray.cancel(attempt.stream, force=True)
+        self._running = []
 
     def _slots(self) -> int:
         if self.workers is not None:

@@ -122,14 +122,18 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
         if not self.size:
             yield from (_do_here(function, job, on_report) for job in waiting)
             return
-        while waiting or any(worker.busy for worker in self._workers):
-            self._hand_out(function, waiting)
-            ready = wait([worker.pipe for worker in self._workers if worker.busy], TICK)
+        try:
+            while waiting or any(worker.busy for worker in self._workers):
+                self._hand_out(function, waiting)
+                ready = wait([worker.pipe for worker in self._workers if worker.busy], TICK)
+                for worker in [w for w in self._workers if w.busy]:
+                    outcome = self._listen(worker, worker.pipe in ready, on_report)
+                    if outcome is not None:
+                        worker.busy = False
+                        yield outcome
+        finally:  # left before the end: the next run would take their outcomes for its own
             for worker in [w for w in self._workers if w.busy]:
-                outcome = self._listen(worker, worker.pipe in ready, on_report)
-                if outcome is not None:
-                    worker.busy = False
-                    yield outcome
+                self._drop(worker)
 
     def _hand_out(self, function: Callable[..., Any], waiting: deque[Any]) -> None:
         idle = [worker for worker in self._workers if not worker.busy]

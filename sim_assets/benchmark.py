@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 
 from scapo.categories import CATEGORIES
 from scapo.store import write_bytes
-from sim_assets.generate import Made, Running, generate
+from sim_assets.generate import Made, Running, generate, open_workers
 from sim_assets.options import DataOptions, SplitName
 from sim_assets.request import make_request, versions
 
@@ -125,20 +125,23 @@ def make_benchmark(
         RenderError: The backend does not work here.
         GenerateError: A folder holds something else, or a split cannot be made.
     """
-    for piece in pieces(only):
-        request, assets = make_request(piece.category, piece.options(sizes or SIZES, backend))
-        settings = request.settings
-        started = time.monotonic()
-        made = generate(
-            request,
-            assets,
-            out / piece.name,
-            versions(settings.backend, settings.protocol),
-            running,
-        )
-        done = Done(piece=piece, made=made, seconds=time.monotonic() - started)
-        _record(out / RECORD, done)
-        yield done
+    chosen, running = pieces(only), running or Running()
+    with open_workers(running) as pool:  # they take seconds to start: one set for all pieces
+        for piece in chosen:
+            request, assets = make_request(piece.category, piece.options(sizes or SIZES, backend))
+            settings = request.settings
+            started = time.monotonic()
+            made = generate(
+                request,
+                assets,
+                out / piece.name,
+                versions(settings.backend, settings.protocol),
+                running,
+                pool,
+            )
+            done = Done(piece=piece, made=made, seconds=time.monotonic() - started)
+            _record(out / RECORD, done)
+            yield done
 
 
 def _record(path: Path, done: Done) -> None:

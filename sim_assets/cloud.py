@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import torch
 import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from scapo.camera import Intrinsics
-from scapo.points import farthest_points
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.options import Sampling
 from sim_assets.renderer import Frame, face_colors
@@ -126,6 +124,10 @@ def choose_far(
     From FPS_POOL times as many points as wanted, drawn at random, where there are more: that makes
     no visible difference and is as much faster as there are more.
     """
+    import torch  # seconds, in each worker, of which few need it
+
+    from scapo.points import farthest_points
+
     if len(points) > FPS_POOL * count:
         pool = choose(len(points), FPS_POOL * count, rng)
         return pool[choose_far(points[pool], count, rng)]

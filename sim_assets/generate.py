@@ -8,6 +8,7 @@ comes last. So a run that was killed and started again leaves the same bytes as 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -64,12 +65,22 @@ class Made:
     """Shards that were there already."""
 
 
+def open_workers(running: Running) -> AbstractPool[Any, Any]:
+    """The workers that do it, as a context manager.
+
+    Raises:
+        ValueError: Their number is out of range.
+    """
+    return open_pool(running.engine, running.workers, timeout=running.timeout)
+
+
 def generate(
     request: Request,
     assets: Sequence[Asset],
     folder: Path,
     versions: Mapping[str, str],
     running: Running | None = None,
+    pool: AbstractPool[Any, Any] | None = None,
 ) -> Made:
     """Make a split, or finish one that was begun.
 
@@ -79,6 +90,7 @@ def generate(
         folder: Of the split.
         versions: Of what makes the pixels, for the manifest.
         running: How.
+        pool: Of `open_workers(running)`, to use the same workers for several splits; it stays open.
 
     Raises:
         GenerateError: The folder holds something else, is in use or cannot be written; no object
@@ -94,7 +106,7 @@ def generate(
     }
     with (
         Ledger(folder, identity, versions) as ledger,
-        open_pool(running.engine, running.workers, timeout=running.timeout) as pool,
+        open_workers(running) if pool is None else nullcontext(pool) as workers,
     ):
         finished = ledger.finished()
         complete = _complete(ledger, finished)
@@ -103,14 +115,14 @@ def generate(
                 write_card(folder)
             return complete
         entries, refused = ledger.entries(assets) or _describe(
-            pool, assets, request.instances, running
+            workers, assets, request.instances, running
         )
         if not entries:
             why = "; ".join(refused.values())
             raise GenerateError(f"{folder}: expected objects that can be read, found none: {why}")
         if ledger.plan is None:
             ledger.begin(entries, refused)
-        return _make(ledger, pool, _Work(request, entries, refused, finished), running)
+        return _make(ledger, workers, _Work(request, entries, refused, finished), running)
 
 
 @dataclass(frozen=True, slots=True)

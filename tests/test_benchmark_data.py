@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scapo.jobs import Pool
 from scapo.store import open_split
 from sim_assets import benchmark
 from sim_assets.__main__ import main
@@ -135,6 +136,18 @@ def test_a_second_run_leaves_all_as_it_is_and_another_folder_gets_the_same(made,
     assert again["digest"] == first["digest"]
     for path in (made / name).iterdir():
         assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
+
+
+def test_all_splits_are_made_by_the_same_workers(made, tmp_path, monkeypatch):
+    started: list[Pool] = []
+    start = Pool._start
+    monkeypatch.setattr(Pool, "_start", lambda pool: started.append(pool) or start(pool))
+    only = ("laptop/train", "sensor/scissors/val")
+    done = list(make_benchmark(tmp_path, only, "raycast", Running(workers=1), TINY))
+    assert (len(done), len(started)) == (3, 1)
+    for item in done:
+        for path in (made / item.piece.name).iterdir():
+            assert (tmp_path / item.piece.name / path.name).read_bytes() == path.read_bytes()
 
 
 def test_the_command(tmp_path, monkeypatch, capsys):

@@ -66,6 +66,14 @@ def test_a_job_that_fails_dies_or_hangs_costs_that_job_only():
     assert ("square 1", 1) in heard
 
 
+def test_a_run_that_is_left_before_its_end_leaves_nothing_to_the_next():
+    with Pool(2) as pool:
+        for outcome in pool.run(act, [("square", 2), ("tick", 3), ("tick", 4)]):
+            assert outcome.result == 4
+            break
+        assert [outcome.result for outcome in pool.run(act, [("square", 5)])] == [25]
+
+
 def test_no_jobs_start_no_process():
     with Pool(2) as pool:
         assert list(pool.run(act, [])) == []
