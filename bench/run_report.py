@@ -51,7 +51,7 @@ def write_report(run: Path) -> Path:
         ("What was run", facts(header)),
         ("Time", stages_table(timing, rows)),
         ("Loss", curves(run) + losses_table(rows)),
-        ("Pictures", pictures(run)),
+        ("Pictures", pictures(run, list(timing["stage_seconds"]))),
         ("How to go on", f"<pre>{escape(commands(header))}</pre>"),
         ("Configuration", _folded(header["config"])),
     ]
@@ -109,7 +109,7 @@ def stages_table(timing: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -
     steps: dict[str, int] = {}
     for row in rows:
         steps[row["stage"]] = row["step"]
-    spent: Mapping[str, float] = timing.get("stage_seconds", {})
+    spent: Mapping[str, float] = timing["stage_seconds"]
     lines, before = [], 0
     for name, seconds in spent.items():
         rate = timing["samples_per_second"].get(name)
@@ -147,10 +147,12 @@ def curves(run: Path) -> str:
     return image(run / CURVES, "terms of the loss against the step")
 
 
-def pictures(run: Path) -> str:
-    """All pictures that training left, the latest of each name."""
-    found = sorted((run / PICTURES).glob("*.png")) if (run / PICTURES).is_dir() else []
-    return "".join(image(path, path.stem) for path in found)
+def pictures(run: Path, stages: list[str]) -> str:
+    """All pictures that training left, the latest of each name, the last stage first."""
+    found = list((run / PICTURES).glob("*.png")) if (run / PICTURES).is_dir() else []
+    order = {stage: number for number, stage in enumerate(reversed(stages))}
+    ranked = sorted((order.get(path.stem.rpartition("-")[0], 0), path) for path in found)
+    return "".join(image(path, path.stem.replace("-", ": ", 1)) for _, path in ranked)
 
 
 def image(path: Path, caption: str) -> str:
@@ -187,7 +189,7 @@ def table(head: list[str], rows: Iterable[Iterable[object]]) -> str:
 
     def cell(tag: str, value: object) -> str:
         text = f"{value:,}" if isinstance(value, int) else str(value)
-        number = text.replace(",", "").replace(".", "").lstrip("-").isdigit()
+        number = bool(head) and text.replace(",", "").replace(".", "").lstrip("-").isdigit()
         return f"<{tag}{' class=n' if number else ''}>{escape(text)}</{tag}>"
 
     lines = [f"<tr>{''.join(f'<th>{escape(name)}</th>' for name in head)}</tr>"] if head else []

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Literal
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 @contextmanager
@@ -40,3 +42,8 @@ def at_least_float32(tensor: Tensor) -> Tensor:
     torch.float32
     """
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
+
+
+def uncompiled(function: F) -> F:
+    """The function as it is, also where its caller is compiled."""
+    return cast("F", torch.compiler.disable(cast("Any", function)))

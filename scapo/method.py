@@ -112,7 +112,7 @@ class AbstractMethod(nn.Module, ABC):
                 method that knows one way alone takes it in both modes.
         """
 
-    def pictures(self, observation: Observation) -> dict[str, PictureData]:
+    def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
         """What training shows of its progress, by name: a template, reconstructions, nothing.
 
         Called in eval mode without gradients, with the same few training clouds each time. It
@@ -120,6 +120,7 @@ class AbstractMethod(nn.Module, ABC):
 
         Args:
             observation: A batch, camera frame, metres.
+            stage: In which training is, or which has ended.
         """
-        del observation
+        del observation, stage
         return {}

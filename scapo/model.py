@@ -33,7 +33,10 @@ from scapo.augment import random_pose
 from scapo.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig
 from scapo.geometry import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
+from scapo.model_pictures import articulated_pictures, canonical_pictures
 from scapo.objectives import Explanation, LossConfig, articulation, canonicalisation
+from scapo.opalign_record import opalign_record
+from scapo.pictures import PictureData
 from scapo.points import Similarity, normalise
 from scapo.refine import refine
 from scapo.skinning import Bones, cross_maps, part_maps
@@ -247,6 +250,15 @@ class Scapo(AbstractMethod):
             terms["labelled_joints"] = config.labelled_joints * error
         return terms
 
+    def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
+        """Canonicalised clouds, reconstructions; in stage 2 the template and the posed template."""
+        points, _ = normalise(observation.points)
+        explanation = self.explain(points)
+        if stage == CANONICALISE:
+            shape, _ = self.decoder(explanation.encoding.code)
+            return canonical_pictures(explanation, shape)
+        return articulated_pictures(explanation, self.bones, self.kinds)
+
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (PROTOCOL 4.4).
@@ -276,20 +288,3 @@ class Scapo(AbstractMethod):
             canonical_points=explanation.template / scale[..., None],
             record=opalign_record(explanation),
         )
-
-
-def opalign_record(e: Explanation) -> dict[str, Tensor]:
-    """What OP-Align's released evaluator asks of a network, under its names.
-
-    Aligned points are R_select^T x - T_select there; S is the aligned shape, I the template.
-    """
-    encoding = e.encoding
-    turned = (encoding.rotation.mT @ encoding.translation[..., None])[..., 0]
-    record = {"R_select": encoding.rotation, "T_select": turned}
-    for letter, joints in (("S", e.joints), ("I", e.template_joints)):
-        record |= {
-            f"{letter}_joint": joints.pivot,
-            f"{letter}_drct": joints.axis,
-            f"{letter}_angl": joints.state,
-        }
-    return record

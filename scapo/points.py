@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo.exact import exact
+from scapo.exact import exact, uncompiled
 
 
 @torch.no_grad()
@@ -43,6 +43,7 @@ def k_nearest(
     return _search(source, target, k)
 
 
+@uncompiled  # blocks, numpy and exact arithmetic are no matter for a compiler
 def _search(
     source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"], k: int
 ) -> Int[Tensor, "*B N {k}"]:
@@ -148,6 +149,12 @@ def farthest_points(
         raise ValueError(f"sampling: expected 1 to {points.shape[-2]} points, found {count}")
     if not 0 <= start < points.shape[-2]:
         raise ValueError(f"sampling: expected a start below {points.shape[-2]}, found {start}")
+    # On a CPU each of the many small steps would be compiled by itself, for minutes.
+    spread = uncompiled(_spread) if points.device.type == "cpu" else _spread
+    return spread(points, count, start)
+
+
+def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
     chosen = torch.full(points.shape[:-2], start, device=points.device)
     distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
     indices = [chosen]

@@ -37,6 +37,6 @@ def draw_progress(
         return
     was_training = method.training
     method.eval()
-    for name, picture in method.pictures(shown(observation)).items():
+    for name, picture in method.pictures(shown(observation), stage).items():
         log.picture(f"{stage}-{name}", picture, step)
     method.train(was_training)
