@@ -20,16 +20,33 @@ from scapo.draw import draw_axis, draw_cloud
 
 TRUE_AXIS, PREDICTED_AXIS = "black", "#cc3311"
 
+PER_ROW = 5
+"""Samples side by side."""
+
 NAMES = ("points", "part", "camera_T_part", "joint_pivot", "joint_axis")
 
 
 def predictions_picture(
-    split: store.Split, predictions: Path, out: Path, samples: Sequence[int]
+    split: store.Split,
+    predictions: Path,
+    out: Path,
+    samples: Sequence[int],
+    *,
+    titles: Sequence[str] | None = None,
+    heading: str | None = None,
 ) -> None:
-    """Two rows: the truth above, the prediction below, one column per sample.
+    """The truth above the prediction, one column per sample, in rows of `PER_ROW`.
 
     Parts are coloured by the true part that the evaluator compares each predicted one with;
     the true axis is drawn dashed and black in both rows, the predicted one red.
+
+    Args:
+        split: The data.
+        predictions: Made on it.
+        out: PNG.
+        samples: Columns.
+        titles: Above each column; the sample's number by default.
+        heading: Of the figure; category and method by default.
 
     Raises:
         StoreError: The predictions are not readable or belong to other data.
@@ -40,24 +57,35 @@ def predictions_picture(
     predicted = {name: array[index] for name, array in predicted.items()}
     part_true = np.where(truth["part"] == UNLABELLED, -1, truth["part"].astype(np.int64))
     part_shown = as_compared(truth, part_true, hard_parts(predicted))
-    figure = Figure(figsize=(1.9 * len(index), 4.3), dpi=130)
-    grid = figure.subplots(2, len(index), squeeze=False)
-    for column, number in enumerate(index):
-        points = truth["points"][column].astype(np.float64)
-        above, below = grid[:, column]
-        draw_cloud(above, points, part_true[column])
-        draw_cloud(below, points, part_shown[column])
+    lines, columns = -(-len(index) // PER_ROW), min(PER_ROW, len(index))
+    figure = Figure(figsize=(0.3 + 1.8 * columns, 0.5 + 3.8 * lines), dpi=160)
+    grid = figure.subplots(2 * lines, columns, squeeze=False)
+    for number, sample in enumerate(index):
+        points = truth["points"][number].astype(np.float64)
+        line, column = divmod(number, PER_ROW)
+        above, below = grid[2 * line : 2 * line + 2, column]
+        draw_cloud(above, points, part_true[number], size=2.5)
+        draw_cloud(below, points, part_shown[number], size=2.5)
         for axes in (above, below):
-            draw_joints(axes, points, truth, column, color=TRUE_AXIS)
-        draw_joints(below, points, predicted, column, color=PREDICTED_AXIS)
-        above.set_title(f"#{number}", fontsize=8)
-    figure.suptitle(
-        f"{header['category']}: truth above, {header['method']} below "
-        "(axis: true dashed, predicted red)",
-        fontsize=10,
-    )
-    figure.tight_layout(rect=(0, 0, 1, 0.96))
+            draw_joints(axes, points, truth, number, color=TRUE_AXIS)
+        draw_joints(below, points, predicted, number, color=PREDICTED_AXIS)
+        above.set_title(titles[number] if titles else f"#{sample}", fontsize=8)
+    words = f"{header['method']} {header.get('variant', '')}".strip()
+    _finish(figure, grid, heading or f"{words}, {header['category']}")
     save(figure, out)
+
+
+def _finish(figure: Figure, grid: np.ndarray, heading: str) -> None:
+    """Titles, the names of the rows, and nothing where there is no sample."""
+    for axes in grid.flat:
+        axes.set_axis_off()
+    figure.suptitle(f"{heading}\njoint axis: true dashed, predicted red", fontsize=9)
+    figure.tight_layout(rect=(0.02, 0, 1, 1), w_pad=0.2, h_pad=0.4)
+    left = 0.06 / figure.get_figwidth()
+    for number, axes in enumerate(grid[:, 0]):
+        box = axes.get_position()
+        name = ("truth", "prediction")[number % 2]
+        figure.text(left, (box.y0 + box.y1) / 2, name, rotation=90, va="center", fontsize=9)
 
 
 def as_compared(truth: store.Arrays, part_true: np.ndarray, part_pred: np.ndarray) -> np.ndarray:
@@ -101,17 +129,27 @@ def training_curve(metrics: Path, out: Path) -> None:
         for name, value in row.items():
             if name.startswith("loss") and isinstance(value, float):
                 stages[str(row.get("stage", ""))][name].append((row["step"], value))
-    figure = Figure(figsize=(5 * max(1, len(stages)), 3.6), dpi=130)
+    figure = Figure(figsize=(5 * max(1, len(stages)), 4.4), dpi=130)
     panels = figure.subplots(1, max(1, len(stages)), squeeze=False)[0]
     for panel, (stage, terms) in zip(panels, stages.items(), strict=False):
-        for name, pairs in sorted(terms.items()):
+        for number, (name, pairs) in enumerate(sorted(terms.items())):
             steps, values = zip(*pairs, strict=True)
-            panel.plot(steps, values, linewidth=1.2, label=name.removeprefix("loss/"))
+            total = name == "loss"
+            panel.plot(
+                steps, values, linewidth=2 if total else 1.1,
+                color="black" if total else f"C{(number - 1) % 10}",
+                linestyle="-" if number <= 10 else "--", label=name.removeprefix("loss/"),
+            )  # fmt: skip
         panel.set_yscale("symlog", linthresh=1e-3)
         panel.set_title(stage, fontsize=10)
-        panel.set_xlabel("step")
-        panel.grid(alpha=0.3)
-        panel.legend(fontsize=6, ncols=2)
+        panel.set_xlabel("step", fontsize=9)
+        panel.tick_params(labelsize=8)
+        panel.grid(alpha=0.25)
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.legend(
+            fontsize=7, ncols=4, frameon=False, loc="upper center", bbox_to_anchor=(0.48, -0.15),
+            columnspacing=1.0, handlelength=1.6,
+        )  # fmt: skip
     figure.tight_layout()
     save(figure, out)
 

@@ -14,6 +14,7 @@ from rich.table import Table
 from bench.evaluate import evaluate
 from bench.explain import explain
 from bench.paper import check
+from bench.pictures_verb import Pictures
 from bench.precision import ApRule
 from bench.prepare import Request
 from bench.reference import Kind, write_reference
@@ -145,6 +146,7 @@ VERBS: dict[str, type] = {
     "tables": Tables,
     "explain": Explain,
     "stability": Stability,
+    "pictures": Pictures,
     "reference": Reference,
 }
 """In the order of the help."""

@@ -90,4 +90,5 @@ def test_training_curve_has_a_panel_for_each_stage(tmp_path: Path, stages: int) 
     training_curve(tmp_path / "metrics.jsonl", out)
     with Image.open(out) as image:
         assert image.width == 650 * stages
-    assert color_count(out, "#1f77b4") > 50
+    assert color_count(out, "#1f77b4") > 50  # a term
+    assert color_count(out, "#000000") > 50  # their sum
