@@ -19,6 +19,7 @@ from bench.score_files import Run, side_file, write_report, write_rows, writing
 from bench.scores import Errors, Rows, Settings, score
 from bench.statistics import BOOTSTRAP_SEED
 from bench.truth import Truth, blocks
+from scapo.provenance import commit, machine
 from scapo.store import Split, sha256_file
 
 __all__ = ["Request", "data_name", "evaluate", "run_of"]
@@ -122,6 +123,9 @@ def _report(
         **{name: getattr(run, name) for name in Run.__slots__},
         "supervision": list(header.supervision),
         "budget": header.budget,
+        "run": header.run,
+        "commit": commit(),
+        "machine": machine(),
         "parts": list(split.manifest.parts),
         "joints": [joint.kind for joint in split.manifest.joints],
         "settings": asdict(request.settings),

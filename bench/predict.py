@@ -27,6 +27,9 @@ from scapo.run_folder import TIMING
 from scapo.store import open_split
 from scapo.types import Observation, Prediction
 
+RUN_FIELDS = ("commit", "config", "data_digest", "machine", "seed", "training")
+"""Of the checkpoint's header, handed on to scores and tables."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Predict:
@@ -83,6 +86,7 @@ class Predict:
                     **timing(self.checkpoint),
                     "seconds_per_cloud": round(seconds, 5),
                 },
+                run={name: header[name] for name in RUN_FIELDS if name in header},
             ),
             {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]},
         )

@@ -42,6 +42,9 @@ class Header:
     budget: dict[str, Any] = field(default_factory=dict)
     """Anything about cost: device, seconds of training, parameters, seconds per cloud."""
 
+    run: dict[str, Any] = field(default_factory=dict)
+    """The training behind it: commit, config, machine, data digest of its split."""
+
     def record(self) -> dict[str, Any]:
         """As stored in the file."""
         return {
@@ -54,6 +57,7 @@ class Header:
             "data_digest": self.data_digest,
             "supervision": sorted(self.supervision),
             "budget": self.budget,
+            "run": self.run,
         }
 
 
@@ -81,9 +85,6 @@ def read_prediction_header(path: Path) -> Header:
     digests = [record[key] for key in DIGEST_KEYS if key in record]
     if not digests:
         raise StoreError(f"{path}: header field {DIGEST_KEYS[0]!r}: expected text, found none")
-    budget = record.get("budget", {})
-    if not isinstance(budget, dict):
-        raise StoreError(f"{path}: header field 'budget': expected an object, found {budget!r}")
     seed = record.get("seed")
     if isinstance(seed, bool) or not isinstance(seed, int) or abs(seed) >= 2**63:
         raise StoreError(f"{path}: header field 'seed': expected an integer, found {seed!r}")
@@ -95,8 +96,16 @@ def read_prediction_header(path: Path) -> Header:
         seed=seed,
         data_digest=_text(path, {DIGEST_KEYS[0]: digests[0]}, DIGEST_KEYS[0]),
         supervision=_supervision(path, record),
-        budget=budget,
+        budget=_object(path, record, "budget"),
+        run=_object(path, record, "run"),
     )
+
+
+def _object(path: Path, record: dict[str, Any], name: str) -> dict[str, Any]:
+    value = record.get(name, {})
+    if not isinstance(value, dict):
+        raise StoreError(f"{path}: header field {name!r}: expected an object, found {value!r}")
+    return value
 
 
 def _text(path: Path, record: dict[str, Any], name: str, *, empty: bool = False) -> str:
