@@ -84,7 +84,7 @@ def run_category(demo: Demo, category: str, console: Console) -> None:
     make_data(demo, steps, data)
     flags = {
         "scapo": ["--preset", "cpu", "--epochs", str(demo.epochs)],
-        "registered": ["--epochs", str(demo.votes), "0", "--no-network-rounds"],
+        "registered": ["--epochs", str(demo.votes)],
     }
     for method in demo.methods:
         run = demo.out / "runs" / f"{category}-{method}"

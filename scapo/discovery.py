@@ -19,12 +19,17 @@ from torch import Tensor
 from scapo.axis_search import JointGuess, Posed, principal_frame, search_joint, still_evidence
 from scapo.consensus import agree
 from scapo.joint_fit import FitOptions, fit
+from scapo.method import evenly
 from scapo.part_evidence import farthest_features, rebuild
-from scapo.pose_search import Found, SearchSpace, search
+from scapo.pose_search import Finalists, Found, SearchSpace, search
 from scapo.registration import register_pairs, rotation_grid
 from scapo.sightings import Views
+from scapo.state_range import narrowest, range_of
 from scapo.template import ArticulatedTemplate, Placement
 from scapo.types import JointKind
+
+AXIS_WEIGHT = 1.0
+"""Of `FitOptions.axis_weight` once a start is chosen: before, wrong axes must be free to turn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +46,11 @@ class DiscoveryConfig:
     """Views of the rounds of search and fit, 0.2 s each and round."""
     trusted: tuple[float, ...] = (0.4, 0.55, 0.7, 0.85)
     """Share of the searched views that each round keeps."""
-    starts: int = 2
-    """Candidate axes of each joint that are optimised."""
+    starts: int = 3
+    """Candidate axes of each joint that are optimised; two of each where joints are several."""
+    contenders: int = 4
+    """Starts of least loss that search `judged` views; the one that explains them best goes on."""
+    judged: int = 48
     template_points: int = 400
 
 
@@ -113,14 +121,6 @@ def wide_states(kinds: tuple[JointKind, ...], count: int = 13) -> Float[Tensor, 
     return torch.stack([torch.linspace(-end, end, count) for end in ends])
 
 
-def seen_states(state: Float[Tensor, "B J"], count: int) -> Float[Tensor, "J {count}"]:
-    """The range of trusted states and a third beyond it on both sides."""
-    low, high = state.quantile(0.03, 0), state.quantile(0.97, 0)
-    room = 0.35 * (high - low).clamp_min(0.2)
-    ends = zip((low - room).tolist(), (high + room).tolist(), strict=True)
-    return torch.stack([torch.linspace(a, b, count) for a, b in ends])
-
-
 def first_template(
     posed: Posed,
     moved: list[Bool[Tensor, "B K"]],
@@ -143,10 +143,10 @@ def first_template(
     return template
 
 
-def best_start(
+def starts(
     posed: Posed, kinds: tuple[JointKind, ...], config: DiscoveryConfig, generator: torch.Generator
-) -> tuple[ArticulatedTemplate, Trusted]:
-    """The start whose short optimisation leaves the least loss."""
+) -> list[tuple[ArticulatedTemplate, Trusted]]:
+    """A template for every combination of candidate axes, those with the least loss first."""
     moved = moved_sets(posed, len(kinds), generator)
     guesses = [
         search_joint(posed, rows, kind, candidate_axes(kind), generator=generator)
@@ -154,7 +154,8 @@ def best_start(
     ]
     none = torch.zeros(len(posed.rotation), len(kinds))
     tried: list[tuple[float, ArticulatedTemplate, Placement]] = []
-    for combination in product(*[found[: config.starts] for found in guesses]):
+    each = config.starts if len(kinds) == 1 else min(config.starts, 2)
+    for combination in product(*[found[:each] for found in guesses]):
         template = first_template(posed, moved, combination, kinds, config.template_points)
         placement = Placement.at(posed.rotation, posed.translation, none)
         for round_number in range(4):
@@ -173,8 +174,8 @@ def best_start(
             template, posed.views, placement, FitOptions(steps=20), generator=generator
         )
         tried.append((float(loss.mean()), template, placement))
-    _, template, placement = min(tried, key=lambda start: start[0])
-    return template, Trusted(views=posed.views, placement=placement)
+    tried.sort(key=lambda start: start[0])
+    return [(t, Trusted(views=posed.views, placement=placement)) for _, t, placement in tried]
 
 
 def trust_order(found: Found) -> Int[Tensor, " B"]:
@@ -187,30 +188,41 @@ def improve(
 ) -> Trusted:
     """Rebuild parts and fit template, joints and placements to the trusted views."""
     placement, views = trusted.placement, trusted.views
-    states = seen_states(placement.state, 11)
+    states = range_of(placement.state, template.kinds).wider(0.25).grid(11)
     for number in range(rounds):
         rebuild(template, views, placement, generator=generator)
         search_at = (0,) if number < rounds // 2 else ()
-        options = FitOptions(steps=25, sharpness=(150.0, 400.0), search_states=search_at)
+        options = FitOptions(
+            steps=25, sharpness=(150.0, 400.0), search_states=search_at, axis_weight=AXIS_WEIGHT
+        )
         placement, _ = fit(template, views, placement, options, states=states, generator=generator)
     return Trusted(views=views, placement=placement)
 
 
 def search_all(
-    template: ArticulatedTemplate,
-    views: Views,
-    trusted: Trusted,
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> Found:
+    template: ArticulatedTemplate, views: Views, trusted: Trusted, config: DiscoveryConfig
+) -> Finalists:
     """Every view over rotations and states, near the cameras that trusted views have."""
     joints = len(template.kinds)
+    known = range_of(trusted.placement.state, template.kinds)
     space = SearchSpace(
-        states=seen_states(trusted.placement.state, 7 if joints == 1 else 4),
+        states=known.wider(0.3).grid(7 if joints == 1 else 4),
         rotations=rotation_grid(config.rotations),
         cameras=trusted.cameras(),
     )
-    return search(template, views, space, generator=generator)
+    return search(template, views, space)
+
+
+def winner(
+    tried: list[tuple[ArticulatedTemplate, Trusted]], views: Views, config: DiscoveryConfig
+) -> tuple[ArticulatedTemplate, Trusted]:
+    """The start that explains views best which it has not seen, among the first few."""
+    some = views.take(evenly(len(views.points), config.judged))
+    losses = []
+    for template, trusted in tried[: config.contenders]:
+        found = search_all(template, some, trusted, config)
+        losses.append(float(found.best().loss.mean()))
+    return tried[min(range(len(losses)), key=losses.__getitem__)]
 
 
 def discover(
@@ -219,18 +231,12 @@ def discover(
     """The articulated template of views of one category, with the views it was fitted to."""
     seeds = evenly(len(views.points), config.seeds)
     posed = common_frame(views.take(seeds), config)
-    template, trusted = best_start(posed, kinds, config, generator)
+    template, trusted = winner(starts(posed, kinds, config, generator), views, config)
     searched = views.take(evenly(len(views.points), config.searched))
     for share in config.trusted:
-        found = search_all(template, searched, trusted, config, generator)
+        finalists = search_all(template, searched, trusted, config)
+        found = finalists.best(narrowest(finalists.placement, finalists.loss, kinds))
         kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
         trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
         trusted = improve(template, trusted, generator)
     return template, trusted
-
-
-def evenly(total: int, count: int) -> Int[Tensor, " K"]:
-    """Indices spread over the whole, all where there are no more than `count`."""
-    if total <= count:
-        return torch.arange(total)
-    return torch.linspace(0, total - 1, count).long()

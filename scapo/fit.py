@@ -28,7 +28,7 @@ from scapo.descent import Descent, NotFiniteError, adam, schedule
 from scapo.files import Arrays
 from scapo.layout import StoreError
 from scapo.log import Log
-from scapo.method import AbstractMethod, Stage, Step
+from scapo.method import AbstractMethod, Stage, Step, evenly
 from scapo.post_mortem import BAD_BATCH, save_batch
 from scapo.precision import Arithmetic
 from scapo.progress_pictures import draw_progress
@@ -214,7 +214,9 @@ class Trainer:
 
     def _stage(self, stage: Stage, optimizer: torch.optim.Adam) -> None:
         """The epochs of a stage that are left."""
-        position, samples = self.state.position, self.data.observation.points.shape[0]
+        position = self.state.position
+        used = evenly(self.data.observation.points.shape[0], stage.clouds)
+        samples = len(used)
         size = min(stage.batch, samples)
         if size < self.ranks.count:
             raise ValueError(
@@ -224,7 +226,7 @@ class Trainer:
         for epoch in range(position.epoch, stage.epochs):
             began = time.monotonic()
             self.method.train()
-            order = torch.randperm(samples, generator=self.state.order)[: steps * size]
+            order = used[torch.randperm(samples, generator=self.state.order)[: steps * size]]
             for number, index in enumerate(order.split(size)):
                 done = (epoch * steps + number) / (stage.epochs * steps)
                 self._step(stage, optimizer, index, done)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
+from jaxtyping import Int
 from torch import Tensor, nn
 
 from scapo.pictures import PictureData
@@ -38,6 +39,8 @@ class Stage:
     min_lr: float = 1e-6
     weight_decay: float = 1e-8
     batch: int = 16
+    clouds: int | None = None
+    """How many of the training clouds, evenly spread (`evenly`), it uses; None: all."""
     parameters: tuple[ParameterGroup, ...] = (ParameterGroup(module=""),)
 
 
@@ -50,6 +53,13 @@ class Step:
     """Share of the stage that is done, in [0, 1)."""
     generator: torch.Generator
     """On the device of the batch; the only source of randomness in `losses`."""
+
+
+def evenly(total: int, count: int | None) -> Int[Tensor, " K"]:
+    """Indices spread over the whole; all where there are no more than `count`, or for None."""
+    if count is None or total <= count:
+        return torch.arange(total)
+    return torch.linspace(0, total - 1, count).long()
 
 
 class AbstractMethod(nn.Module, ABC):

@@ -15,12 +15,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.joint_fit import FitOptions, fit, thin, view_loss
+from scapo.joint_fit import search_states, thin, view_loss
+from scapo.placement_steps import StepOptions, settle
 from scapo.registration import NORMAL_WEIGHT, NearestGrid, distinct, within
 from scapo.sightings import Views, free_and_hidden
+from scapo.state_range import StateRange
 from scapo.template import ArticulatedTemplate, Placement
 
-CHUNK = 512
+CHUNK = 256
 """Hypotheses refined at once."""
 
 
@@ -33,7 +35,7 @@ class SearchSpace:
     """template_R_view"""
     cameras: Float[Tensor, "V 3"] | None
     """Directions in the template frame near which cameras are sought, None for anywhere."""
-    keep: int = 40
+    keep: int = 64
     """Hypotheses of each view that are refined."""
 
 
@@ -105,7 +107,8 @@ def propose(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> 
         tried = space.rotations
         if space.cameras is not None:
             near = (tried @ view.direction()[0] @ space.cameras.mT).amax(-1)
-            tried = tried[near.topk(max(space.keep * 8, int((near > 0.3).sum()))).indices]
+            wanted = max(space.keep * 8, int((near > 0.3).sum()))
+            tried = tried[near.topk(min(len(tried), wanted)).indices]
         cost, move = coarse_cost(view, (*posed, grid), tried)
         least, state = cost.min(0)
         best = distinct(tried[None], least[None], space.keep, 25.0)[0]
@@ -115,28 +118,51 @@ def propose(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> 
     return Placement.cat(found)
 
 
+@torch.no_grad()
 def refine(
     template: ArticulatedTemplate,
     views: Views,
     start: Placement,
-    *,
-    generator: torch.Generator,
-    steps: int = 25,
-    points: int = 96,
+    options: StepOptions | None = None,
 ) -> tuple[Placement, Float[Tensor, " H"]]:
     """Improve hypotheses (as many as views) and give the loss of each."""
+    options = options or StepOptions()
     placements, losses = [], []
-    for index in torch.arange(len(views.points)).split(CHUNK):
+    for index in torch.arange(len(views.points), device=views.points.device).split(CHUNK):
         part = views.take(index)
-        options = FitOptions(steps=steps, sharpness=(80.0, 250.0), points=points, shared=False)
-        placement, _ = fit(template, part, start.take(index), options, generator=generator)
-        with torch.no_grad():
-            some = thin(part, torch.arange(0, part.points.shape[1], 2))
-            loss = view_loss(some, template.place(placement), 250.0, 2.0)
-            loss = loss + 0.05 * placement.log_scale.square().sum(-1)
+        placement = settle(template, part, start.take(index), options)
+        some = thin(part, torch.arange(0, part.points.shape[1], 2, device=index.device))
+        loss = view_loss(some, template.place(placement), 250.0, 2.0)
         placements.append(placement)
-        losses.append(loss)
+        losses.append(loss + 0.05 * placement.log_scale.square().sum(-1))
     return Placement.cat(placements), torch.cat(losses)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finalists:
+    """The best distinct placements of each of B views, F of each, those of a view in a row."""
+
+    placement: Placement
+    loss: Float[Tensor, "B F"]
+
+    def best(self, states: StateRange | None = None) -> Found:
+        """The best of each view; those with states outside the range are charged for it."""
+        loss = self.loss
+        if states is not None:
+            loss = loss + states.penalty(self.placement.state.unflatten(0, loss.shape))
+        return best_of(self.placement, loss.flatten(), len(loss))
+
+
+def settle_states(
+    template: ArticulatedTemplate, views: Views, found: Found, states: StateRange
+) -> Placement:
+    """The placements with every state tried over its range, each followed by a few steps."""
+    placement = found.placement
+    for sharpness in (150.0, 250.0):
+        some = thin(views, torch.arange(0, views.points.shape[1], 2, device=views.points.device))
+        placement = search_states(template, some, placement, states.grid(13), sharpness)
+        placement, _ = refine(template, views, placement, StepOptions(steps=5, points=256))
+    return placement
 
 
 def best_of(placement: Placement, loss: Float[Tensor, " H"], count: int) -> Found:
@@ -150,45 +176,35 @@ def best_of(placement: Placement, loss: Float[Tensor, " H"], count: int) -> Foun
     return Found(placement=chosen, loss=loss[index], margin=other - loss[index])
 
 
-def search(
-    template: ArticulatedTemplate,
-    views: Views,
-    space: SearchSpace,
-    *,
-    generator: torch.Generator,
-) -> Found:
-    """The best placement of every view over all rotations and states."""
-    start = propose(template, views, space)
-    return tournament(template, views, start, generator=generator)
+def search(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Finalists:
+    """The best placements of every view over all rotations and states."""
+    return tournament(template, views, propose(template, views, space))
 
 
-ROUNDS = ((6, 48, 16), (12, 64, 5), (25, 96, 0))
-"""Of `tournament`: steps, points, and how many distinct hypotheses of a view go on."""
+ROUNDS = (
+    (StepOptions(steps=3, points=48, template_points=64), 16),
+    (StepOptions(steps=5, points=96), 6),
+    (StepOptions(steps=10, points=128), 0),
+)
+"""Of `tournament`: steps, and how many distinct hypotheses of a view go on."""
 
 
-def tournament(
-    template: ArticulatedTemplate,
-    views: Views,
-    start: Placement,
-    *,
-    generator: torch.Generator,
-) -> Found:
+def tournament(template: ArticulatedTemplate, views: Views, start: Placement) -> Finalists:
     """The best of many hypotheses of each view (as many for each, one after the other).
 
     All are refined a little, the best distinct ones further, and fewer still to the end: right
     hypotheses are seldom the best before refinement, and few steps tell the hopeless ones.
     """
     count = len(views.points)
-    placement, loss = start, torch.zeros(len(start.state))
-    for steps, points, left in ROUNDS:
+    first = torch.arange(count, device=views.points.device)
+    placement, loss = start, views.points.new_zeros(len(start.state))
+    for options, left in ROUNDS:
         number = len(placement.state) // count
-        index = torch.arange(count).repeat_interleave(number)
-        placement, loss = refine(
-            template, views.take(index), placement, generator=generator, steps=steps, points=points
-        )
+        index = first.repeat_interleave(number)
+        placement, loss = refine(template, views.take(index), placement, options)
         if left:
             table = placement.rotation.unflatten(0, (count, number))
             best = distinct(table, loss.view(count, number), min(left, number), 12.0)
-            chosen = (best + torch.arange(count)[:, None] * number).flatten()
+            chosen = (best + first[:, None] * number).flatten()
             placement, loss = placement.take(chosen), loss[chosen]
-    return best_of(placement, loss, count)
+    return Finalists(placement=placement, loss=loss.view(count, -1))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.template import Placement
@@ -61,10 +61,16 @@ class PseudoPlacements(nn.Module):
         names = self.NAMES[1:6]
         return Placement(**{name: getattr(self, name) for name in names})
 
-    def find(self, first: Float[Tensor, "B 3"]) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
-        """Row of each cloud, and whether it is there."""
+    def find(self, first: Float[Tensor, "B 3"]) -> Int[Tensor, " B"]:
+        """Row of each cloud, by its first point.
+
+        Raises:
+            ValueError: A cloud that is not there.
+        """
         gap = (first[:, None] - self.key).abs().sum(-1)
-        return gap.argmin(1), gap.amin(1) == 0
+        if bool((gap.amin(1) > 0).any()):
+            raise ValueError("expected clouds whose placements were found, found others")
+        return gap.argmin(1)
 
     def _load_from_state_dict(
         self,

@@ -3,19 +3,20 @@
 
 Training. Views of the category are registered and fitted jointly into one articulated template
 (`discovery`), which is then searched for in the training views; a small network (`point_votes`)
-learns the placements of the trusted ones. The network's own proposals, refined, replace those
-placements that they beat by the loss, the template is fitted again, and the network goes on
-learning. No label is used anywhere: starts, hypotheses and trust are chosen by the loss of the
-views alone. Camera positions of the training clouds are known (their frame's origin).
+learns the placements of the trusted ones. No label is used anywhere: starts, hypotheses and trust
+are chosen by the loss of the views alone. Camera positions of the training clouds are known (their
+frame's origin).
 
-Prediction knows no camera: the network estimates it. `fast` is the network alone; `refine` fits
-the template to the cloud from the network's four hypotheses and the best of a grid.
+`fast` is the network alone, which sees the points only; `refine` fits the template to the cloud
+from the network's four hypotheses and the best of a grid. For that it asks where the camera was:
+at the origin of the cloud's frame or at `Observation.sensor`, or (`camera="estimated"`) where the
+network believes it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import roma
 import torch
@@ -25,22 +26,26 @@ from torch import Tensor, nn
 
 from scapo.discovery import (
     DiscoveryConfig,
-    Trusted,
     discover,
     evenly,
-    improve,
     search_all,
-    seen_states,
     trust_order,
 )
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
 from scapo.placed import nearest_weights, placed_prediction, slides
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
-from scapo.points import farthest_points, gather, nearest, normalise
-from scapo.pose_search import Found, SearchSpace, best_of, propose, refine, tournament
+from scapo.points import Similarity, farthest_points, gather, nearest, normalise
+from scapo.pose_search import (
+    Found,
+    SearchSpace,
+    propose,
+    settle_states,
+    tournament,
+)
 from scapo.pseudo_placements import PseudoPlacements
 from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
+from scapo.state_range import StateRange, range_of
 from scapo.template import ArticulatedTemplate, Placement, interleave, turn_placement
 from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
 
@@ -50,22 +55,22 @@ class RegisteredConfig:
     """SCAPO by registration and joint fit."""
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    learned: int = 600
-    """Training views whose placements the network learns."""
+    learned: int = 1200
+    """Training clouds whose placements the network learns, 0.25 s each on one core."""
     trusted: float = 0.85
     """Share of them that it learns from."""
-    epochs: tuple[int, int] = (100, 60)
-    """Of the network, before and after its proposals are taken back into the placements."""
+    epochs: int = 40
+    """Of the network."""
     lr: float = 1e-3
     batch: int = 32
     width: int = 48
     """Of the network; 48 gives 0.2 million parameters."""
     points: int = 256
     """Of each cloud."""
-    grid_hypotheses: int = 32
+    grid_hypotheses: int = 64
     """Placements of a grid search that `refine` tries beside the network's four; 0 for none."""
-    network_rounds: bool = True
-    """Whether the network's proposals are searched and the template fitted again."""
+    camera: Literal["known", "estimated"] = "known"
+    """Whether `refine` takes the camera from the cloud's frame or from the network."""
 
 
 class RegisteredScapo(AbstractMethod):
@@ -91,75 +96,39 @@ class RegisteredScapo(AbstractMethod):
     @property
     def variant(self) -> str:
         """Named switches that differ from the default."""
-        return "" if self.config.network_rounds else "no network rounds"
+        return "" if self.config.camera == "known" else "camera estimated"
 
     def stages(self) -> tuple[Stage, ...]:
-        """The network, before and after its proposals were taken back."""
-        first, second = self.config.epochs
-        learned = (ParameterGroup(module="network"),)
-        stages = (
-            Stage(
-                name="votes",
-                epochs=first,
-                lr=self.config.lr,
-                min_lr=self.config.lr * (0.3 if second else 0.01),
-                batch=self.config.batch,
-                parameters=learned,
-            ),
-            Stage(
-                name="votes-again",
-                epochs=second,
-                lr=self.config.lr * 0.6,
-                min_lr=self.config.lr * 0.01,
-                batch=self.config.batch,
-                parameters=learned,
-            ),
+        """The network's; the template is found before it starts."""
+        stage = Stage(
+            name="votes",
+            epochs=self.config.epochs,
+            lr=self.config.lr,
+            min_lr=self.config.lr * 0.01,
+            batch=self.config.batch,
+            clouds=self.config.learned,
+            parameters=(ParameterGroup(module="network"),),
         )
-        return stages if second else stages[:1]
+        return (stage,)
 
     def start(
         self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
     ) -> None:
-        """Find the placements (first stage), or take the network's proposals into them."""
-        del labels
+        """Find the template, and its placement in the clouds that the network will learn."""
+        del stage, labels
         index = evenly(len(observation.points), self.config.learned)
         cloud = observation.points[index]
         points, similarity = normalise(cloud)
         camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
         views = observe(points, camera, count=self.config.points)
-        if stage == "votes":
-            found = self._discover(views, generator)
-        elif self.config.network_rounds:
-            found = self._take_back(views, generator)
-        else:
-            return
-        self._set_pseudo(cloud[:, 0], views, found)
+        self._set_pseudo(cloud[:, 0], views, self._discover(views, generator))
 
     def _discover(self, views: Views, generator: torch.Generator) -> Found:
         template, trusted = discover(views, self.template.kinds, self.config.discovery, generator)
         self.template.load_state_dict(template.state_dict())
-        return search_all(self.template, views, trusted, self.config.discovery, generator)
-
-    def _take_back(self, views: Views, generator: torch.Generator) -> Found:
-        """Better placements from the network's proposals, and the template fitted to them."""
-        for _ in range(2):
-            found = self._rounds_with_network(views, generator)
-            order = trust_order(found)
-            kept = order[: max(8, round(self.config.trusted * len(order)))][:300]
-            trusted = Trusted(views=views.take(kept), placement=found.placement.take(kept))
-            self.pseudo.set(self.pseudo.key, found.placement, self.pseudo.camera, self.pseudo.trust)
-            improve(self.template, trusted, generator, rounds=3)
-        return self._rounds_with_network(views, generator)
-
-    def _rounds_with_network(self, views: Views, generator: torch.Generator) -> Found:
-        with torch.no_grad():
-            proposals, _ = self._hypotheses(views.points)
-        count = len(views.points)
-        own = self.pseudo.placement()
-        mixed = interleave([proposals, own], count)
-        index = torch.arange(count).repeat_interleave(5)
-        placement, loss = refine(self.template, views.take(index), mixed, generator=generator)
-        return best_of(placement, loss, count)
+        finalists = search_all(self.template, views, trusted, self.config.discovery)
+        states = range_of(trusted.placement.state, self.template.kinds)
+        return finalists.best(states.wider(0.1))
 
     def _set_pseudo(self, key: Tensor, views: Views, found: Found) -> None:
         order = trust_order(found)
@@ -173,15 +142,14 @@ class RegisteredScapo(AbstractMethod):
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`vote_losses`)."""
         del labels
-        row, there = self.pseudo.find(observation.points[:, 0])
-        row = row[there] if bool(there.any()) else row
-        cloud = observation.points[there] if bool(there.any()) else observation.points
-        points, _ = normalise(cloud)
-        index = torch.randperm(points.shape[1], generator=step.generator)
+        row = self.pseudo.find(observation.points[:, 0])
+        points, _ = normalise(observation.points)
+        device = points.device
+        index = torch.randperm(points.shape[1], generator=step.generator, device=device)
         points = points[:, index[: 2 * self.config.points]]
         points = gather(points, farthest_points(points, self.config.points))
         frame = self._random_frames(points, step.generator)
-        noise = torch.randn(points.shape, generator=step.generator) * 0.003
+        noise = torch.randn(points.shape, generator=step.generator, device=device) * 0.003
         votes = self.network((points + noise) @ frame.mT)
         return vote_losses(votes, self._target(points, row))
 
@@ -190,9 +158,10 @@ class RegisteredScapo(AbstractMethod):
     ) -> Float[Tensor, "B 3 3"]:
         """One of each cloud's four principal frames, turned a little."""
         frames = principal_frames(points)
-        pick = torch.randint(4, (len(points),), generator=generator)
-        turn = 0.15 * torch.randn(len(points), 3, generator=generator)
-        return roma.rotvec_to_rotmat(turn) @ frames[torch.arange(len(points)), pick]
+        device, count = points.device, len(points)
+        pick = torch.randint(4, (count,), generator=generator, device=device)
+        turn = 0.15 * torch.randn(count, 3, generator=generator, device=device)
+        return roma.rotvec_to_rotmat(turn) @ frames[torch.arange(count, device=device), pick]
 
     @torch.no_grad()
     def _target(self, points: Float[Tensor, "B K 3"], row: Int[Tensor, " B"]) -> Target:
@@ -242,43 +211,50 @@ class RegisteredScapo(AbstractMethod):
             weight = gather(votes.part[row].softmax(-1), near)
             chosen = placement.take(row)
         else:
-            chosen, camera, confidence = self._refined(points, placement, votes, row)
+            camera = self._camera(observation, similarity, placement.take(row), votes.camera[row])
+            chosen, confidence = self._refined(points, camera, placement)
             weight = nearest_weights(self.template, points, chosen, camera)
         return placed_prediction(self.template, chosen, weight, similarity, confidence)
 
-    @torch.enable_grad()
+    def _camera(
+        self, observation: Observation, similarity: Similarity, placement: Placement, vote: Tensor
+    ) -> Float[Tensor, "B 3"]:
+        """The camera's centre in the normalised frame of each cloud."""
+        if self.config.camera == "estimated":
+            return (placement.rotation @ vote[..., None])[..., 0] + placement.translation
+        sensor = observation.sensor
+        away = -similarity.centre if sensor is None else sensor - similarity.centre
+        return away * similarity.scale[:, None]
+
     def _refined(
-        self, points: Tensor, placement: Placement, votes: Votes, row: Tensor
-    ) -> tuple[Placement, Float[Tensor, "B 3"], Float[Tensor, " B"]]:
-        """The best hypothesis of network and grid after a few steps of the fit, and its camera.
+        self, points: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"], proposed: Placement
+    ) -> tuple[Placement, Float[Tensor, " B"]]:
+        """The best hypothesis of network and grid after a few steps, and its margin.
 
         All happens in the first principal frame of each cloud, so that the grids of rotations
         and of the depth image turn with it.
         """
-        count = len(points)
-        camera = (placement.rotation @ votes.camera[..., None])[..., 0] + placement.translation
-        camera = camera[row]
         frame = principal_frames(points)[:, 0]
         turned = (frame @ camera[..., None])[..., 0]
         views = observe(points @ frame.mT, turned, count=self.config.points)
-        start = [turn_placement(placement, frame.repeat_interleave(4, 0))]
+        start = [turn_placement(proposed, frame.repeat_interleave(4, 0))]
         if self.config.grid_hypotheses:
             start.append(propose(self.template, views, self._space()))
-        generator = torch.Generator().manual_seed(0)
-        found = tournament(self.template, views, interleave(start, count), generator=generator)
-        final, _ = refine(
-            self.template, views, found.placement, generator=generator, steps=25, points=192
-        )
-        return turn_placement(final, frame.mT), camera, found.margin
+        finalists = tournament(self.template, views, interleave(start, len(points)))
+        found = finalists.best(self._states().wider(0.1))
+        final = settle_states(self.template, views, found, self._states())
+        return turn_placement(final, frame.mT), found.margin
+
+    def _states(self) -> StateRange:
+        """Of the trusted training views."""
+        return range_of(self.pseudo.state[self.pseudo.trust > 0], self.template.kinds)
 
     def _space(self) -> SearchSpace:
         """States and cameras of the trusted training views."""
         trusted = self.pseudo.trust > 0
         return SearchSpace(
-            states=seen_states(
-                self.pseudo.state[trusted], 5 if len(self.template.kinds) == 1 else 3
-            ),
-            rotations=rotation_grid(self.config.discovery.rotations),
+            states=self._states().wider(0.2).grid(7 if len(self.template.kinds) == 1 else 4),
+            rotations=rotation_grid(self.config.discovery.rotations).to(self.pseudo.camera),
             cameras=F.normalize(self.pseudo.camera[trusted], dim=-1),
             keep=self.config.grid_hypotheses,
         )

@@ -88,6 +88,8 @@ class Observation:
     """Camera frame, metres."""
     color: Float[Tensor, "*B N 3"] | None = None
     """In [0, 1]."""
+    sensor: Float[Tensor, "*B 3"] | None = None
+    """Centre of the camera, for clouds in another frame; None: the origin, as in its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

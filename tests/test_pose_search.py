@@ -3,13 +3,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from sighted import sighted, template
-from strategies import generator
 
 from scapo.geometry import rotation_angle
-from scapo.pose_search import SearchSpace, best_of, search, state_grid
+from scapo.pose_search import (
+    Found,
+    SearchSpace,
+    best_of,
+    search,
+    settle_states,
+    state_grid,
+)
 from scapo.registration import rotation_grid
+from scapo.state_range import OUTSIDE_COST, StateRange
 from scapo.template import Placement
 
 
@@ -18,13 +27,26 @@ def test_known_placements_are_found():
     space = SearchSpace(
         states=torch.linspace(0, 1, 4)[None], rotations=rotation_grid(700), cameras=None, keep=8
     )
-    found = search(template(), views, space, generator=generator(0))
+    finalists = search(template(), views, space)
+    found = finalists.best()
     errors = rotation_angle(found.placement.rotation, truth.rotation).rad2deg()
     assert errors.median() < 8
     assert (errors < 15).sum() >= 3
     assert bool((found.margin >= 0).all())
     state = (found.placement.state - truth.state).abs()[errors < 15]
     assert state.max() < 0.2
+    high = StateRange(low=torch.tensor([3.0]), high=torch.tensor([4.0]), unit=torch.ones(1))
+    assert torch.allclose(finalists.best(high).loss, found.loss + OUTSIDE_COST)
+
+
+def test_a_wrong_state_is_corrected_and_the_rest_kept():
+    views, truth = sighted(4, seed=41)
+    wrong = replace(truth, state=(truth.state + 0.5) % 1.0)
+    found = Found(placement=wrong, loss=torch.zeros(4), margin=torch.zeros(4))
+    states = StateRange(low=torch.zeros(1), high=torch.ones(1), unit=torch.ones(1))
+    settled = settle_states(template(), views, found, states)
+    assert (settled.state - truth.state).abs().max() < 0.15
+    assert rotation_angle(settled.rotation, truth.rotation).rad2deg().max() < 8
 
 
 def test_all_combinations_of_states():

@@ -81,8 +81,24 @@ def test_refinement_brings_the_template_closer():
     assert torch.allclose(refined.part_weight.sum(-1), torch.tensor(1.0), atol=1e-4)
 
 
-def test_stages_follow_the_switch():
-    made = RegisteredScapo(RegisteredConfig(epochs=(3, 0)), CATEGORIES["drawer"], generator(0))
-    assert [stage.name for stage in made.stages()] == ["votes"]
+def test_one_stage_over_the_clouds_that_were_placed():
+    config = RegisteredConfig(epochs=3, learned=20)
+    made = RegisteredScapo(config, CATEGORIES["drawer"], generator(0))
+    (stage,) = made.stages()
+    assert (stage.name, stage.epochs, stage.clouds) == ("votes", 3, 20)
     assert made.variant == ""
     assert sum(p.numel() for p in made.parameters()) < 1_500_000
+
+
+def test_the_known_camera_moves_with_the_cloud():
+    method, observation = trained()
+    turn, move = random_rotations(1, generator(3))[0], torch.tensor([0.3, -0.2, 0.5])
+    moved = Observation(
+        points=observation.points @ turn.T + move, sensor=move.expand(len(observation.points), 3)
+    )
+    plain, turned = (method.predict(seen, "refine") for seen in (observation, moved))
+    assert plain.camera_T_part is not None
+    assert turned.camera_T_part is not None
+    expected = turn @ plain.camera_T_part[:, 0, :3, :3]
+    angles = rotation_angle(turned.camera_T_part[:, 0, :3, :3], expected).rad2deg()
+    assert angles.median() < 1
