@@ -13,12 +13,14 @@ import numpy as np
 
 from bench.explain_plots import plot_ladder, plot_strata
 from bench.ladder import RUNGS, Rung, climb
+from bench.ladder_text import ladder_markdown
 from bench.predictions import Predictions
 from bench.prepare import Request, fit_frames, open_data
 from bench.scores import Errors
 from bench.statistics import Interval, interval
 from bench.strata import Stratum, factors, stratify
 from bench.truth import blocks
+from scapo.provenance import commit
 from scapo.store import write_bytes
 
 STRATA_COLUMNS = ("factor", "lower", "upper", "metric", "unit", "samples", "mean", "low", "high",
@@ -36,6 +38,9 @@ class Explanation:
     title: str
     strata: tuple[Stratum, ...]
     ladder: Ladder
+    medians: dict[Rung, dict[tuple[str, str], float]]
+    facts: dict[str, str]
+    """What was explained, by which code."""
 
 
 def measure(request: Request) -> Explanation:
@@ -67,8 +72,19 @@ def measure(request: Request) -> Explanation:
         rung: {key: interval(table, instance) for key, table in errors.items()}
         for rung, errors in joined.items()
     }
+    medians: dict[Rung, dict[tuple[str, str], float]] = {
+        rung: {key: _median(table) for key, table in errors.items()}
+        for rung, errors in joined.items()
+    }
     words = (header.method, header.variant, header.category, header.split)
     return Explanation(
+        medians=medians,
+        facts={
+            "samples": f"{len(instance)} of {len(np.unique(instance))} objects",
+            "seed": str(header.seed),
+            "data": header.data_digest[:12],
+            "code": commit(),
+        },
         title=" ".join(word for word in words if word),
         strata=tuple(stratify(joined["predicted"], values, instance)),
         ladder=ladder,
@@ -76,13 +92,16 @@ def measure(request: Request) -> Explanation:
 
 
 def explain(request: Request) -> list[Path]:
-    """Write `strata.{csv,png}` and `ladder.{csv,png}` to the folder `request.out`.
+    """Write `ladder.{md,csv,png}` and `strata.{csv,png}` to the folder `request.out`.
 
     Raises:
         StoreError: As `evaluate`.
     """
     found = measure(request)
     contents = {
+        "ladder.md": ladder_markdown(
+            found.ladder, found.medians, found.title, found.facts
+        ).encode(),
         "ladder.csv": _ladder_csv(found.ladder).encode(),
         "ladder.png": plot_ladder(found.ladder, found.title),
         "strata.csv": _strata_csv(found.strata).encode(),
@@ -91,6 +110,11 @@ def explain(request: Request) -> list[Path]:
     for name, data in contents.items():
         write_bytes(request.out / name, data)
     return [request.out / name for name in contents]
+
+
+def _median(table: np.ndarray) -> float:
+    known = table[np.isfinite(table)]
+    return float(np.median(known)) if known.size else float("nan")
 
 
 def _joined(found: list[Errors]) -> Errors:

@@ -24,7 +24,8 @@ LABELS = {
 }
 """What is plotted, in this order."""
 
-BAR, EDGE = "#4477aa", "#222222"
+BAR, EDGE, BEST, PLAIN = "#4477aa", "#222222", "#cc3311", "#bbbbbb"
+PIECES: tuple[Rung, ...] = ("pose", "parts", "joint", "state")
 
 
 def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
@@ -36,7 +37,7 @@ def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
     figure.subplots_adjust(
         left=0.06, right=0.99, bottom=0.5 / height, top=1 - 0.8 / height, wspace=0.25, hspace=0.5
     )
-    grid = figure.subplots(len(metrics), len(names), squeeze=False)
+    grid = figure.subplots(len(metrics), len(names), squeeze=False, sharey="row")
     for row, key in enumerate(metrics):
         for column, name in enumerate(names):
             axes: Axes = grid[row][column]
@@ -54,29 +55,56 @@ def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
 
 
 def plot_ladder(ladder: dict[Rung, dict[tuple[str, str], Interval]], title: str) -> bytes:
-    """A panel per metric, a bar per rung."""
+    """A panel per metric, a bar per rung; red is the piece whose truth helps most."""
     metrics = [key for key in LABELS if key in ladder["predicted"]]
-    figure = Figure(figsize=(3.2 * len(metrics), 3.4))
-    figure.subplots_adjust(left=0.04, right=0.99, bottom=0.24, top=0.83, wspace=0.25)
-    grid = figure.subplots(1, len(metrics), squeeze=False)
-    for axes, key in zip(grid[0], metrics, strict=True):
-        _bars(axes, [values[key] for values in ladder.values()], list(ladder), turned=True)
+    columns = -(-len(metrics) // 2)
+    figure = Figure(figsize=(3.1 * columns, 5.6))
+    figure.subplots_adjust(left=0.06, right=0.99, bottom=0.145, top=0.87, wspace=0.22, hspace=0.62)
+    grid = figure.subplots(2, columns, squeeze=False)
+    for axes in grid.flat[len(metrics) :]:
+        axes.set_axis_off()
+    for axes, key in zip(grid.flat, metrics, strict=False):
+        values: dict[Rung, Interval] = {rung: found[key] for rung, found in ladder.items()}
+        colors = {rung: BAR if rung in PIECES else PLAIN for rung in values}
+        best = helps_most(values, higher=key[0] == "iou")
+        if best is not None:
+            colors[best] = BEST
+        _bars(axes, list(values.values()), list(values), colors=list(colors.values()), turned=True)
+        if values["predicted"].count:
+            axes.axhline(values["predicted"].mean, color=EDGE, linewidth=0.7, linestyle=":")
         axes.set_title(LABELS[key], fontsize=9)
     return _png(figure, f"{title}: one piece replaced by the truth")
 
 
+def helps_most(values: dict[Rung, Interval], *, higher: bool) -> Rung | None:
+    """The piece whose truth improves the mean most, None where none improves it."""
+    sign = 1 if higher else -1
+    start = sign * values["predicted"].mean
+    known: list[Rung] = [rung for rung in PIECES if values[rung].count]
+    best = max(known, key=lambda rung: sign * values[rung].mean, default=None)
+    if best is None or sign * values[best].mean - start <= 1e-9:
+        return None
+    return best
+
+
 def _bars(
-    axes: Axes, values: Sequence[Interval], labels: Sequence[str], *, turned: bool = False
+    axes: Axes,
+    values: Sequence[Interval],
+    labels: Sequence[str],
+    *,
+    colors: Sequence[str] | None = None,
+    turned: bool = False,
 ) -> None:
     for place, value in enumerate(values):
         if value.count:
             below, above = max(0.0, value.mean - value.low), max(0.0, value.high - value.mean)
-            axes.bar(place, value.mean, color=BAR)
+            axes.bar(place, value.mean, color=colors[place] if colors else BAR)
             axes.errorbar(place, value.mean, [[below], [above]], color=EDGE, capsize=2, lw=1)
         else:
             axes.text(place, 0, "–", ha="center", va="bottom")
     axes.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60 if turned else 0)
     axes.tick_params(axis="y", labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
     axes.margins(y=0.1)
     axes.set_ylim(bottom=0)
 

@@ -106,7 +106,7 @@ class Explain:
     data: Path
     """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
     out: Path
-    """Folder for ladder.csv, ladder.png, strata.csv and strata.png."""
+    """Folder for ladder.md, ladder.csv, ladder.png, strata.csv and strata.png."""
     split: str = "test"
     """Split that was predicted."""
     calibration: Path | None = None

@@ -12,13 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from bench import __main__ as program
 from bench.evaluate import Request, evaluate
-from bench.explain import LADDER_COLUMNS, STRATA_COLUMNS, measure
-from bench.explain_plots import plot_ladder, plot_strata
-from bench.ladder import RUNGS
+from bench.explain import LADDER_COLUMNS, STRATA_COLUMNS, Ladder, measure
+from bench.explain_plots import helps_most, plot_ladder, plot_strata
+from bench.ladder import RUNGS, Rung
+from bench.ladder_text import ladder_markdown, limits
 from bench.predictions import write_predictions
 from bench.reference import write_reference
 from bench.score_files import read_scores
 from bench.scores import Settings
+from bench.statistics import Interval
 from bench.strata import factors, stratify
 from bench.truth import blocks
 from scapo.store import StoreError, open_split
@@ -252,6 +254,34 @@ def test_the_files(tmp_path):
         assert tuple(rows[0]) == columns
         assert len(rows) > 30
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "ladder.md").read_text().startswith("### made laptop test")
+
+
+def test_the_summary_names_what_limits_a_wrong_pose(split, tmp_path):
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec([0.3, 0.2, -0.1]).as_matrix()
+    path = tmp_path / "p.safetensors"
+    write_predictions(path, made.header_of(split), moved_whole(split, motion))
+    found = measure(Request(predictions=path, data=root(split), out=tmp_path))
+    text = ladder_markdown(found.ladder, found.medians, found.title, {"seed": "1", "code": ""})
+    angle = np.degrees(np.linalg.norm([0.3, 0.2, -0.1]))
+    (row,) = [line for line in text.splitlines() if line.startswith("| as predicted")]
+    assert f"{angle:.1f} / {angle:.1f}" in row
+    (row,) = [line for line in text.splitlines() if line.startswith("| **true base pose**")]
+    assert "0.0 / 0.0" in row
+    assert f"- R {angle:.1f}: pose (0.0, cures 100 %)" in text
+    assert "seed: 1" in text
+    assert "code:" not in text
+    columns = {line.count("|") for line in text.splitlines() if line.startswith("|")}
+    assert len(columns) == 1
+    values: dict[Rung, Interval] = {
+        rung: item["part_rotation", "deg"] for rung, item in found.ladder.items()
+    }
+    assert helps_most(values, higher=False) == "pose"
+    perfect: Ladder = dict.fromkeys(RUNGS, found.ladder["all"])
+    assert "- S 100.0: no single piece cures a fifth of it" in limits(perfect)
+    best: dict[Rung, Interval] = {rung: item["iou", "1"] for rung, item in perfect.items()}
+    assert helps_most(best, higher=True) is None
 
 
 def test_the_command_refuses_what_it_cannot_read(split, tmp_path, capsys):
