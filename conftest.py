@@ -9,6 +9,7 @@ NEEDS = {
     "sim_assets/scene.py": "sapien",
     "sim_assets/actuate.py": "sapien",
     "sim_assets/parallel_scene.py": "mani_skill",
+    "tests/speed/many.py": "mani_skill",
     "sim_assets/raycast.py": "embreex",
 }
 
