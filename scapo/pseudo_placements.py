@@ -25,6 +25,8 @@ class PseudoPlacements(nn.Module):
     """Centres in the template frame."""
     trust: Tensor
     """Weight of each when the network learns."""
+    belonging: Tensor
+    """Which points of each cloud belong to the object (bool)."""
     NAMES: ClassVar[tuple[str, ...]] = (
         "key",
         "rotation",
@@ -40,6 +42,7 @@ class PseudoPlacements(nn.Module):
         super().__init__()
         for name in self.NAMES:
             self.register_buffer(name, torch.zeros(0))
+        self.register_buffer("belonging", torch.ones(0, 0, dtype=torch.bool))
 
     def set(self, key: Tensor, placement: Placement, camera: Tensor, trust: Tensor) -> None:
         """Replace all."""
@@ -80,7 +83,7 @@ class PseudoPlacements(nn.Module):
         **named: Any,  # noqa: ANN401
     ) -> None:
         """Take the size of what is loaded."""
-        for name in self.NAMES:
+        for name in (*self.NAMES, "belonging"):
             if prefix + name in state_dict:
                 setattr(self, name, torch.zeros_like(state_dict[prefix + name]))
         super()._load_from_state_dict(state_dict, prefix, *rest, **named)

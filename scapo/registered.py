@@ -3,7 +3,8 @@
 
 Training. Views of the category are registered and fitted jointly into one articulated template
 (`discovery`), which is then searched for in the training views; a small network (`point_votes`)
-learns the placements of the trusted ones. No label is used anywhere: starts, hypotheses and trust
+learns the placements of the trusted ones. Points that a mask let in (`stray_points`) are left out.
+No label is used anywhere: starts, hypotheses and trust
 are chosen by the loss of the views alone. Camera positions of the training clouds are known (their
 frame's origin).
 
@@ -46,6 +47,7 @@ from scapo.pseudo_placements import PseudoPlacements
 from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
 from scapo.state_range import StateRange, range_of
+from scapo.stray_points import belongs, replaced, without_strays
 from scapo.template import ArticulatedTemplate, Placement, interleave, turn_placement
 from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
 
@@ -118,10 +120,12 @@ class RegisteredScapo(AbstractMethod):
         del stage, labels
         index = evenly(len(observation.points), self.config.learned)
         cloud = observation.points[index]
-        points, similarity = normalise(cloud)
+        belonging = belongs(cloud)
+        points, similarity = normalise(replaced(cloud, belonging))
         camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
         views = observe(points, camera, count=self.config.points)
         self._set_pseudo(cloud[:, 0], views, self._discover(views, generator))
+        self.pseudo.belonging = belonging
 
     def _discover(self, views: Views, generator: torch.Generator) -> Found:
         template, trusted = discover(views, self.template.kinds, self.config.discovery, generator)
@@ -143,7 +147,7 @@ class RegisteredScapo(AbstractMethod):
         """The network's votes against the placements that were found (`vote_losses`)."""
         del labels
         row = self.pseudo.find(observation.points[:, 0])
-        points, _ = normalise(observation.points)
+        points, _ = normalise(replaced(observation.points, self.pseudo.belonging[row]))
         device = points.device
         index = torch.randperm(points.shape[1], generator=step.generator, device=device)
         points = points[:, index[: 2 * self.config.points]]
@@ -200,8 +204,9 @@ class RegisteredScapo(AbstractMethod):
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Parts, poses and joints; part frames sit at the middle of the template's base."""
-        points, similarity = normalise(observation.points)
-        kept = gather(points, farthest_points(points, self.config.points))
+        clean, similarity = normalise(without_strays(observation.points))
+        points = similarity.forward(observation.points)
+        kept = gather(clean, farthest_points(clean, self.config.points))
         placement, (votes, sure) = self._hypotheses(kept)
         best = sure.argmax(1)
         row = torch.arange(len(points)) * 4 + best
@@ -212,7 +217,7 @@ class RegisteredScapo(AbstractMethod):
             chosen = placement.take(row)
         else:
             camera = self._camera(observation, similarity, placement.take(row), votes.camera[row])
-            chosen, confidence = self._refined(points, camera, placement)
+            chosen, confidence = self._refined(clean, camera, placement)
             weight = nearest_weights(self.template, points, chosen, camera)
         return placed_prediction(self.template, chosen, weight, similarity, confidence)
 

@@ -27,6 +27,7 @@ def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
     method.template.load_state_dict(template().state_dict())
     camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
     method.pseudo.set(cloud[:, 0], truth, camera, torch.ones(12))
+    method.pseudo.belonging = torch.ones(cloud.shape[:2], dtype=torch.bool)
     observation = Observation(points=cloud)
     optimiser = torch.optim.Adam(method.network.parameters(), 3e-3)
     g = generator(1)
