@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import tyro
+from jaxtyping import Int
 from rich.console import Console
 from rich.progress import track
 
@@ -20,6 +22,7 @@ from bench.oracle import OracleMethod
 from bench.predictions import Header, write_predictions
 from bench.train import pick_device
 from scapo.data import SampleDataset, label, observe
+from scapo.discovery import evenly
 from scapo.files import Arrays
 from scapo.method import AbstractMethod, Mode
 from scapo.resident import map_labels
@@ -52,6 +55,9 @@ class Predict:
     """auto (CUDA where there is a GPU), cpu, cuda, ..."""
     batch: int = 32
     """Clouds at a time."""
+    limit: int | None = None
+    """Predict so many clouds alone, evenly spread over the split (500 are enough to calibrate);
+    the others have no answer in the file."""
 
     def run(self, console: Console) -> None:
         """Load, predict batch by batch, write the file."""
@@ -61,13 +67,13 @@ class Predict:
         oracle = self._oracle_words(method)
         split = open_split(self.data, header["category"], self.split)
         samples = SampleDataset(split)
-        batches = torch.arange(len(samples)).split(self.batch)
+        chosen = evenly(len(samples), self.limit or len(samples))
         started = time.perf_counter()
-        arrays = [
+        parts = [
             self._answer(method, samples, index, device)
-            for index in track(batches, description="predict", console=console)
+            for index in track(chosen.split(self.batch), description="predict", console=console)
         ]
-        seconds = (time.perf_counter() - started) / len(samples)
+        seconds = (time.perf_counter() - started) / len(chosen)
         words = [method.variant, "" if self.mode == "fast" else self.mode, *oracle]
         write_predictions(
             self.out,
@@ -88,10 +94,10 @@ class Predict:
                 },
                 run={name: header[name] for name in RUN_FIELDS if name in header},
             ),
-            {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]},
+            joined(parts, chosen.numpy(), len(samples)),
         )
         console.print(
-            f"{len(samples)} clouds, {1000 * seconds:.1f} ms each: {self.out}", soft_wrap=True
+            f"{len(chosen)} clouds, {1000 * seconds:.1f} ms each: {self.out}", soft_wrap=True
         )
 
     def _oracle_words(self, method: AbstractMethod) -> list[str]:
@@ -116,6 +122,18 @@ class Predict:
             labels = map_labels(label(batch).keep(method.oracle), lambda tensor: tensor.to(device))
             return to_arrays(method.predict_given(observation, labels))
         return to_arrays(method.predict(observation, self.mode))
+
+
+def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -> Arrays:
+    """The answers of batches one after the other, NaN for the samples that are not `chosen`."""
+    out = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if len(chosen) == count:
+        return out
+    full = {name: np.full((count, *array.shape[1:]), np.nan, array.dtype)
+            for name, array in out.items()}  # fmt: skip
+    for name, array in full.items():
+        array[chosen] = out[name]
+    return full
 
 
 def timing(run: Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from bench.results import load
 from bench.score_files import side_file
 from bench.scores import Settings
 from bench.stability_verb import Stability
+from bench.study import Study
 from bench.tables import write
 
 
@@ -147,6 +148,7 @@ VERBS: dict[str, type] = {
     "explain": Explain,
     "stability": Stability,
     "pictures": Pictures,
+    "study": Study,
     "reference": Reference,
 }
 """In the order of the help."""
