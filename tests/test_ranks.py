@@ -10,9 +10,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import made
 import numpy as np
 import pytest
 import torch
+from test_train import SMALL
 from tiny import tiny_data
 from two_ranks import CONFIG, Line, still
 
@@ -117,6 +119,23 @@ def test_nan_on_one_rank_stops_all_with_its_batch(folder: Path, said: list[dict[
 def test_another_number_of_ranks_does_not_resume(folder: Path) -> None:
     with pytest.raises(StoreError, match=r'training: expected .*"ranks":1.* to resume, found'):
         fit.fit(Line(), tiny_data(), folder / "line", CONFIG, resume=True)
+
+
+@pytest.mark.slow
+def test_the_command_as_torchrun_starts_it(tmp_path: Path) -> None:
+    """One run, one report, one set of lines, whatever the number of processes."""
+    made.make_data(tmp_path / "data", train=16)
+    words = ["-m", "bench", "train", "scapo", "--category", "laptop", "--device", "cpu", *SMALL]
+    words += ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
+    done = torchrun(*words)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.count("Run:") == 1
+    _, header = read_checkpoint(tmp_path / "run")
+    assert (header["training"]["ranks"], header["finished"]) == (2, True)
+    assert (tmp_path / "run" / "report.html").is_file()
+    again = torchrun(*words)
+    assert again.returncode != 0
+    assert "expected no run there, found one; resume continues it" in again.stderr
 
 
 def test_one_process_is_one_rank(monkeypatch: pytest.MonkeyPatch) -> None:

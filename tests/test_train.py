@@ -77,6 +77,22 @@ def test_the_run_is_that_of_the_flags(run: Path) -> None:
     assert header["category"] == "laptop"
 
 
+def test_the_flags_of_speed_reach_the_run(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command("train", "scapo", "--category", "laptop", "--data", data, "--out", out, "--device",
+            "cpu", *SMALL, "--precision", "bfloat16", "--no-tf32", "--no-pictures")  # fmt: skip
+    training = read_header(out / "checkpoint.safetensors")["training"]
+    assert training == {
+        "precision": "bfloat16",
+        "compiled": False,
+        "tf32": False,
+        "clip": 10.0,
+        "ranks": 1,
+    }
+    assert (out / "report.html").is_file()
+    assert not (out / "pictures").exists()
+
+
 def test_resume_leaves_a_finished_run(run: Path, data: Path) -> None:
     before = (run / "checkpoint.safetensors").read_bytes()
     command("train", "scapo", "--category", "laptop", "--data", data, "--out", run, "--device",
@@ -97,6 +113,9 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
     assert header.data_digest == split.manifest.digest
     assert header.budget["parameters"] > 1000
     assert header.budget["training_seconds"] > 0
+    trained = read_header(run / "checkpoint.safetensors")
+    for name in ("commit", "config", "machine", "data_digest", "training", "seed"):
+        assert header.run[name] == trained[name], name
     one = tmp_path / "one.safetensors"
     command("predict", run, "--data", data, "--out", one, "--device", "cpu", "--batch", "5")
     for name, value in read(one)[0].items():
