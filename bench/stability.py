@@ -32,8 +32,8 @@ BOOTSTRAPS = 500
 POINTED = ("camera_T_part", "joint_pivot", "joint_axis")
 """What resampling compares: one answer per cloud, whatever its points."""
 
-Answer = Callable[[Float[np.ndarray, "B N 3"]], Rows]
-"""Clouds, camera frame, metres -> the tensors of a predictions file."""
+Answer = Callable[[Float[np.ndarray, "B N 3"], Float[np.ndarray, "B 3"]], Rows]
+"""Clouds in metres and the centres of their cameras -> the tensors of a predictions file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +56,7 @@ def equivariance(
     answer: Answer, points: Float[np.ndarray, "S N 3"], revolute: np.ndarray, plan: Plan
 ) -> dict[MotionKind, Errors]:
     """Changes by kind of motion: (quantity, unit) -> (S, motions * K)."""
-    still = in_batches(answer, points, plan.batch)
+    still = in_batches(answer, points, np.zeros((len(points), 3), np.float32), plan.batch)
     generator = torch.Generator().manual_seed(plan.seed)
     out: dict[MotionKind, Errors] = {}
     for kind in MOTIONS:
@@ -65,7 +65,8 @@ def equivariance(
             motion = random_motions(len(points), kind, generator)
             there = points.astype(np.float64) @ np.swapaxes(motion[:, :3, :3], 1, 2)
             there = (there + motion[:, None, :3, 3]).astype(np.float32)
-            back = moved(in_batches(answer, there, plan.batch), np.linalg.inv(motion))
+            sensor = motion[:, :3, 3].astype(np.float32)  # the camera moves with what it saw
+            back = moved(in_batches(answer, there, sensor, plan.batch), np.linalg.inv(motion))
             found.append(changes(still, back, points, revolute))
         out[kind] = {key: np.concatenate([item[key] for item in found], 1) for key in found[0]}
     return out
@@ -103,14 +104,17 @@ def resampled(
     for _ in range(plan.resamplings):
         chosen = generator.permuted(np.tile(np.arange(total), (count, 1)), axis=1)
         subset = np.take_along_axis(points, chosen[:, : plan.points, None], 1)
-        rows = in_batches(answer, subset, plan.batch)
+        rows = in_batches(answer, subset, np.zeros((count, 3), np.float32), plan.batch)
         answers.append({name: rows[name] for name in POINTED if name in rows})
     return scatter(answers, points)
 
 
-def in_batches(answer: Answer, points: Float[np.ndarray, "S N 3"], batch: int) -> Rows:
+def in_batches(
+    answer: Answer, points: Float[np.ndarray, "S N 3"], sensor: Float[np.ndarray, "S 3"], batch: int
+) -> Rows:
     """The answers for all clouds."""
-    pieces = [answer(points[first : first + batch]) for first in range(0, len(points), batch)]
+    starts = range(0, len(points), batch)
+    pieces = [answer(points[k : k + batch], sensor[k : k + batch]) for k in starts]
     return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
@@ -120,10 +124,12 @@ class Timed:
     def __init__(self, answer: Answer) -> None:
         self.answer, self.clouds, self.seconds = answer, 0, 0.0
 
-    def __call__(self, points: Float[np.ndarray, "B N 3"]) -> Rows:
+    def __call__(
+        self, points: Float[np.ndarray, "B N 3"], sensor: Float[np.ndarray, "B 3"]
+    ) -> Rows:
         """Answer, and count."""
         started = time.perf_counter()
-        rows = self.answer(points)
+        rows = self.answer(points, sensor)
         self.seconds += time.perf_counter() - started
         self.clouds += len(points)
         return rows

@@ -83,7 +83,7 @@ class Stability:
         modes: tuple[Mode, ...] = ("fast", "refine") if self.mode == "both" else (self.mode,)
         measured = {
             mode: measure(
-                Timed(lambda cloud, mode=mode: _answer(method, cloud, mode, device)),
+                Timed(lambda *seen, mode=mode: _answer(method, seen, mode, device)),
                 points, instance, revolute(split.manifest), plan,
             )
             for mode in modes
@@ -127,8 +127,9 @@ def measure(
     return out
 
 
-def _answer(method: AbstractMethod, points: np.ndarray, mode: Mode, device: str) -> Rows:
-    observation = Observation(points=torch.from_numpy(points).to(device))
+def _answer(method: AbstractMethod, seen: tuple[np.ndarray, ...], mode: Mode, device: str) -> Rows:
+    points, sensor = (torch.from_numpy(values).to(device) for values in seen)
+    observation = Observation(points=points, sensor=sensor)
     return to_arrays(method.predict(observation, mode))
 
 

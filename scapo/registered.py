@@ -217,7 +217,8 @@ class RegisteredScapo(AbstractMethod):
             chosen = placement.take(row)
         else:
             camera = self._camera(observation, similarity, placement.take(row), votes.camera[row])
-            chosen, confidence = self._refined(clean, camera, placement)
+            frame = principal_frames(kept)[torch.arange(len(kept)), best]
+            chosen, confidence = self._refined(clean, camera, frame, placement)
             weight = nearest_weights(self.template, points, chosen, camera)
         return placed_prediction(self.template, chosen, weight, similarity, confidence)
 
@@ -232,14 +233,17 @@ class RegisteredScapo(AbstractMethod):
         return away * similarity.scale[:, None]
 
     def _refined(
-        self, points: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"], proposed: Placement
+        self,
+        points: Float[Tensor, "B N 3"],
+        camera: Float[Tensor, "B 3"],
+        frame: Float[Tensor, "B 3 3"],
+        proposed: Placement,
     ) -> tuple[Placement, Float[Tensor, " B"]]:
         """The best hypothesis of network and grid after a few steps, and its margin.
 
-        All happens in the first principal frame of each cloud, so that the grids of rotations
-        and of the depth image turn with it.
+        All happens in the principal frame in which the network is surest, so that the grids of
+        rotations and of the depth image turn with the cloud.
         """
-        frame = principal_frames(points)[:, 0]
         turned = (frame @ camera[..., None])[..., 0]
         views = observe(points @ frame.mT, turned, count=self.config.points)
         start = [turn_placement(proposed, frame.repeat_interleave(4, 0))]
