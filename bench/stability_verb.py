@@ -81,13 +81,11 @@ class Stability:
             batch=self.batch,
         )
         modes: tuple[Mode, ...] = ("fast", "refine") if self.mode == "both" else (self.mode,)
+        kinds = revolute(split.manifest)
         measured = {
-            mode: measure(
-                Timed(lambda *seen, mode=mode: _answer(method, seen, mode, device)),
-                points, instance, revolute(split.manifest), plan,
-            )
+            mode: measure(Timed(_Answer(method, mode, device)), points, instance, kinds, plan)
             for mode in modes
-        }  # fmt: skip
+        }
         report = _report(method, header, split, index, plan) | {
             "modes": measured, "commit": commit(), "machine": machine(device),
         }  # fmt: skip
@@ -127,10 +125,20 @@ def measure(
     return out
 
 
-def _answer(method: AbstractMethod, seen: tuple[np.ndarray, ...], mode: Mode, device: str) -> Rows:
-    points, sensor = (torch.from_numpy(values).to(device) for values in seen)
-    observation = Observation(points=points, sensor=sensor)
-    return to_arrays(method.predict(observation, mode))
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """A method's predictions for clouds and the centres of their cameras."""
+
+    method: AbstractMethod
+    mode: Mode
+    device: str
+
+    def __call__(self, points: np.ndarray, sensor: np.ndarray) -> Rows:
+        observation = Observation(
+            points=torch.from_numpy(points).to(self.device),
+            sensor=torch.from_numpy(sensor).to(self.device),
+        )
+        return to_arrays(self.method.predict(observation, self.mode))
 
 
 def _plain(values: np.ndarray) -> list[list[float | None]]:

@@ -57,11 +57,11 @@ class RegisteredConfig:
     """SCAPO by registration and joint fit."""
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    learned: int = 1200
+    learned: int = 600
     """Training clouds whose placements the network learns, 0.25 s each on one core."""
     trusted: float = 0.85
     """Share of them that it learns from."""
-    epochs: int = 40
+    epochs: int = 60
     """Of the network."""
     lr: float = 1e-3
     batch: int = 32
