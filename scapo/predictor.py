@@ -12,9 +12,11 @@ from torch import Tensor
 
 from scapo.categories import CATEGORIES, category
 from scapo.checkpoint import config_from, load_arrays, read_checkpoint
+from scapo.files import Arrays, Header
 from scapo.layout import StoreError
 from scapo.method import Mode
 from scapo.model import Scapo, ScapoConfig
+from scapo.registered import RegisteredConfig, RegisteredScapo
 from scapo.types import Joints, Observation, Prediction
 
 RELEASED = "weights"
@@ -22,19 +24,27 @@ RELEASED = "weights"
 
 
 class Predictor:
-    """A trained SCAPO model for clouds of one category."""
+    """A trained SCAPO model, as published or `registered`, for clouds of one category."""
 
-    def __init__(self, model: Scapo, device: str) -> None:
+    def __init__(self, model: Scapo | RegisteredScapo, device: str) -> None:
         """Hold the model in eval mode on the device."""
         self.model = model.to(device).eval()
         self.device = device
+        self.least = 16 if isinstance(model, RegisteredScapo) else model.config.encoder.neighbours
 
-    def predict(self, points: np.ndarray | Tensor, mode: Mode = "fast") -> Prediction:
+    def predict(
+        self,
+        points: np.ndarray | Tensor,
+        mode: Mode = "fast",
+        sensor: np.ndarray | Tensor | None = None,
+    ) -> Prediction:
         """Parts, poses and joints of one cloud or of several.
 
         Args:
             points: (..., N, 3), camera frame, metres, numpy or torch.
             mode: `fast`, networks only, or `refine`.
+            sensor: (..., 3), centre of the camera, metres, for clouds in another frame than the
+                camera's. What `refine` of a `registered` model uses.
 
         Returns:
             Tensors on the CPU with the same leading dimensions; `np.asarray` takes them as they
@@ -45,15 +55,19 @@ class Predictor:
                 are not finite.
         """
         cloud = torch.as_tensor(points, dtype=torch.float32, device=self.device)
-        least = self.model.config.encoder.neighbours
-        if cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < least:
+        if cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < self.least:
             raise ValueError(
-                f"points: expected shape (..., N, 3) with N at least {least}, "
+                f"points: expected shape (..., N, 3) with N at least {self.least}, "
                 f"found {tuple(cloud.shape)}"
             )
         shape = cloud.shape[:-2]
         flat = cloud.reshape(-1, *cloud.shape[-2:])
-        return _reshaped(self.model.predict(Observation(points=flat), mode), shape)
+        centre = None
+        if sensor is not None:
+            centre = torch.as_tensor(sensor, dtype=torch.float32, device=self.device)
+            centre = centre.expand(*shape, 3).reshape(-1, 3)
+        observation = Observation(points=flat, sensor=centre)
+        return _reshaped(self.model.predict(observation, mode), shape)
 
 
 def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
@@ -69,12 +83,25 @@ def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
     """
     path = find(path_or_category)
     arrays, header = read_checkpoint(path)
-    if header.get("method") != Scapo.name:
-        raise StoreError(f"{path}: expected method {Scapo.name!r}, found {header.get('method')!r}")
-    config = config_from(ScapoConfig, header["config"], f"{path}: config")
-    model = Scapo(config, category(header["category"]), torch.Generator())
+    return Predictor(_model(header, arrays, path), device)
+
+
+def _model(header: Header, arrays: Arrays, path: Path) -> Scapo | RegisteredScapo:
+    """The method of a checkpoint with its weights."""
+    kind = category(header["category"])
+    where, none = f"{path}: config", torch.Generator()
+    if header.get("method") == Scapo.name:
+        model = Scapo(config_from(ScapoConfig, header["config"], where), kind, none)
+    elif header.get("method") == RegisteredScapo.name:
+        config = config_from(RegisteredConfig, header["config"], where)
+        model = RegisteredScapo(config, kind, none)
+    else:
+        raise StoreError(
+            f"{path}: expected method {Scapo.name!r} or {RegisteredScapo.name!r}, "
+            f"found {header.get('method')!r}"
+        )
     load_arrays(model, arrays, path)
-    return Predictor(model, device)
+    return model
 
 
 def find(path_or_category: str | Path) -> Path:

@@ -8,12 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hinged import plates
+from strategies import generator
 from tiny import TINY, tiny
 from torch.testing import assert_close
 
+from scapo.categories import CATEGORIES
 from scapo.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.layout import StoreError
 from scapo.predictor import load
+from scapo.registered import RegisteredConfig, RegisteredScapo
 from scapo.types import Observation
 
 
@@ -54,5 +57,18 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere: expected a run folder, a checkpoint or a cat"):
         load("nowhere")
     write_checkpoint(tmp_path / WEIGHTS, tiny(), checkpoint_header("other", TINY, "laptop", {}))
-    with pytest.raises(StoreError, match="expected method 'scapo', found 'other'"):
+    with pytest.raises(StoreError, match="expected method 'scapo' or 'registered', found 'other'"):
         load(tmp_path)
+
+
+def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
+    config = RegisteredConfig(points=64, width=8)
+    model = RegisteredScapo(config, CATEGORIES["laptop"], generator(0)).eval()
+    write_checkpoint(
+        tmp_path / WEIGHTS, model, checkpoint_header("registered", config, "laptop", {})
+    )
+    points = plates(2, 96)[0].points
+    wanted = model.predict(Observation(points=points))
+    found = load(tmp_path).predict(points, sensor=np.zeros(3))
+    assert_close(found.part_weight, wanted.part_weight)
+    assert_close(found.camera_T_part, wanted.camera_T_part)
