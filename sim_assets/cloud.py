@@ -17,7 +17,8 @@ from jaxtyping import Float, Int, UInt8
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.options import Sampling
-from sim_assets.renderer import Frame, face_colors
+from sim_assets.renderer import Frame
+from sim_assets.textures import Paint
 from sim_assets.views import generator
 
 SURFACE_SAMPLES = 512
@@ -168,7 +169,7 @@ def _back_project(
 class Surface:
     """Points drawn uniformly by area from each part's surface, for `visible` and `full` clouds."""
 
-    def __init__(self, thing: ArticulatedObject) -> None:
+    def __init__(self, thing: ArticulatedObject, *, color: bool = False) -> None:
         self.meshes = [thing.part_mesh(part) for part in range(len(thing.visuals))]
         drawn = [
             sample_surface(mesh, SURFACE_SAMPLES, generator("surface", thing.instance, part))
@@ -179,7 +180,7 @@ class Surface:
             [mesh.face_normals[face] for mesh, (_, face) in zip(self.meshes, drawn, strict=True)]
         )
         self._both = np.concatenate([self.points, self.normals], 1)
-        self.colors = [face_colors(visuals) for visuals in thing.visuals]
+        self.paints = [Paint(visuals) for visuals in thing.visuals] if color else []
         self.areas = np.array([mesh.area for mesh in self.meshes])
         self.tolerance = TOLERANCE * float(np.linalg.norm(thing.extents()))
 
@@ -236,19 +237,18 @@ class Surface:
         number = np.maximum(rng.multinomial(dense, share / share.sum()), least)
         number[number.argmax()] += dense - number.sum()
         points, colors = [], []
-        for mesh, pose, table, n in zip(
-            self.meshes, camera_T_part, self.colors, number, strict=True
-        ):
+        for p, (mesh, pose, n) in enumerate(zip(self.meshes, camera_T_part, number, strict=True)):
             drawn, face = sample_surface(mesh, int(n), rng)
             points.append(drawn @ pose[:3, :3].T + pose[:3, 3])
-            colors.append(table[face])
+            if self.paints:
+                colors.append(self.paints[p].colors(face, drawn))
         part = np.repeat(np.arange(len(number), dtype=np.uint8), number)
         every = np.concatenate(points)
         chosen = choose_far(every, count, rng) if sampling == "fps" else rng.permutation(count)
         return Cloud(
             points=every[chosen].astype(np.float32),
             part=part[chosen],
-            color=np.concatenate(colors)[chosen],
+            color=np.concatenate(colors)[chosen] if colors else None,
         )
 
 

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
-from trimesh.visual import TextureVisuals
+from trimesh.visual import ColorVisuals, TextureVisuals
 
 from sim_assets.articulated import Visual
 from sim_assets.files import MeshResolver, SourceFiles
 from sim_assets.robot import Color, Link, Robot, Shape
 from sim_assets.sides import two_sided
 from sim_assets.solids import solid
+from sim_assets.textures import find_image, is_readable
 from sim_assets.validate import MAX_COORDINATE, MAX_FACES, AssetError, check_mesh, refuse
 
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
@@ -88,6 +89,7 @@ def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[
             scene = trimesh.load_scene(
                 io.BytesIO(data), file_type=form, resolver=resolver, process=False
             )
+            _check_textures(scene, resolver)
             meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
             return [_piece(mesh) for mesh in meshes if len(mesh.faces)], str(scene.units)
     except AssetError:
@@ -97,6 +99,17 @@ def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[
         raise refuse(path, f"the package {package} to read it", "it is not installed") from error
     except Exception as error:
         raise refuse(path, f"a valid {form} file", f"{type(error).__name__}: {error}") from error
+
+
+def _check_textures(scene: trimesh.Scene, resolver: MeshResolver) -> None:
+    """Leave out those that are no pictures; the surface then has its material's colour."""
+    for mesh in scene.geometry.values():
+        material = getattr(mesh.visual, "material", None)
+        image = find_image(material)
+        if image is not None and not is_readable(image):
+            setattr(material, "image" if hasattr(material, "image") else "baseColorTexture", None)
+            name = resolver.mesh.name
+            resolver.files.repairs.add("A texture that cannot be read was left out", name)
 
 
 def _piece(mesh: trimesh.Trimesh) -> Visual:
@@ -110,9 +123,9 @@ def _piece(mesh: trimesh.Trimesh) -> Visual:
         color = visual.main_color if visual is not None and visual.defined else None
         return Visual(mesh=plain, color=_rgba(color))
     material = visual.material
-    image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
-    if image is not None and visual.uv is not None and len(visual.uv) == len(vertices):
-        plain.visual = TextureVisuals(uv=np.asarray(visual.uv, float), material=material)
+    uv = np.asarray([] if visual.uv is None else visual.uv, float)
+    if find_image(material) and uv.shape == (len(vertices), 2) and np.isfinite(uv).all():
+        plain.visual = TextureVisuals(uv=uv, material=material)
     return Visual(mesh=plain, color=_rgba(getattr(material, "main_color", None)))
 
 
@@ -161,7 +174,11 @@ def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visu
     moved = vertices @ pose[:3, :3].T + pose[:3, 3]
     if np.abs(moved[np.unique(faces)]).max() > MAX_COORDINATE:
         raise refuse(files.urdf, f"{where}: coordinates below {MAX_COORDINATE:g}", "larger ones")
-    return Visual(mesh=remade(piece.mesh, moved, faces), color=shape.color or piece.color)
+    mesh = remade(piece.mesh, moved, faces)
+    if shape.color is None:
+        return Visual(mesh=mesh, color=piece.color)
+    mesh.visual = ColorVisuals()  # the URDF's colour stands in for the file's material
+    return Visual(mesh=mesh, color=shape.color)
 
 
 def remade(

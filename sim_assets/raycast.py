@@ -17,7 +17,8 @@ from jaxtyping import Float, Int
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.renderer import BACKGROUND, AbstractRenderer, Frame, RenderError, face_colors
+from sim_assets.renderer import BACKGROUND, AbstractRenderer, Frame, RenderError
+from sim_assets.textures import Paint
 
 REBUILD_BELOW = 12_000
 """Triangles up to which an object is merged and rebuilt for each view."""
@@ -36,7 +37,7 @@ class RaycastRenderer(AbstractRenderer):
         meshes = [thing.part_mesh(part) for part in range(len(thing.visuals))]
         self.vertices = [np.asarray(mesh.vertices, np.float64) for mesh in meshes]
         self.faces = [np.asarray(mesh.faces, np.int32) for mesh in meshes]
-        self.colors = [face_colors(thing.visuals[part]) for part in range(len(meshes))]
+        self.paints = [Paint(visuals) for visuals in thing.visuals] if self.color else []
         self.large = sum(len(faces) for faces in self.faces) > REBUILD_BELOW
         self.scenes = [
             _embree(vertices, faces) if self.large else None
@@ -59,7 +60,21 @@ class RaycastRenderer(AbstractRenderer):
         pixels, rays = _rays(camera, np.concatenate(list(in_camera.values())))
         cast = self._cast_parts if self.large else self._cast_merged
         depth, part, face = cast(poses, in_camera, rays)
-        return self._frame(camera, pixels, depth, part, face)
+        shape = (camera.height, camera.width)
+        image = np.zeros(shape, np.float32)
+        label = np.full(shape, BACKGROUND, np.uint8)
+        image.flat[pixels] = np.where(part == BACKGROUND, 0, depth)
+        label.flat[pixels] = part
+        if not self.color:
+            return Frame(depth=image, part=label)
+        color = np.zeros((*shape, 3), np.uint8)
+        for p, paint in enumerate(self.paints):
+            seen = np.flatnonzero(part == p)
+            part_T_camera = np.linalg.inv(poses[p])
+            surface = _move(rays[seen] * depth[seen, None], part_T_camera)
+            inward = surface - part_T_camera[:3, 3]
+            color.reshape(-1, 3)[pixels[seen]] = paint.colors(face[seen], surface, inward)
+        return Frame(depth=image, part=label, color=color)
 
     def close(self) -> None:
         """Drop the object and its scenes."""
@@ -107,27 +122,6 @@ class RaycastRenderer(AbstractRenderer):
             nearer = (hit >= 0) & (distance < depth)
             depth[nearer], part[nearer], face[nearer] = distance[nearer], p, hit[nearer]
         return depth, part, face
-
-    def _frame(
-        self,
-        camera: Intrinsics,
-        pixels: Int[np.ndarray, " K"],
-        depth: np.ndarray,
-        part: np.ndarray,
-        face: np.ndarray,
-    ) -> Frame:
-        shape = (camera.height, camera.width)
-        image = np.zeros(shape, np.float32)
-        label = np.full(shape, BACKGROUND, np.uint8)
-        image.flat[pixels] = np.where(part == BACKGROUND, 0, depth)
-        label.flat[pixels] = part
-        if not self.color:
-            return Frame(depth=image, part=label)
-        color = np.zeros((*shape, 3), np.uint8)
-        for p, table in enumerate(self.colors):
-            seen = part == p
-            color.reshape(-1, 3)[pixels[seen]] = table[face[seen]]
-        return Frame(depth=image, part=label, color=color)
 
 
 def _embree(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> EmbreeScene:

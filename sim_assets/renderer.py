@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from scapo.camera import Intrinsics
-from sim_assets.articulated import ArticulatedObject, Visual
+from sim_assets.articulated import ArticulatedObject
 
 Backend = Literal["sapien", "raycast", "maniskill"]
 AUTO: tuple[Backend, ...] = ("sapien", "raycast")
@@ -178,9 +178,3 @@ _CHECK: dict[str, Callable[[], str | None]] = {
     "raycast": _raycast_missing,
     "maniskill": _maniskill_missing,
 }
-
-
-def face_colors(visuals: tuple[Visual, ...]) -> UInt8[np.ndarray, "F 3"]:
-    """SRGB colour of each face of a part, in the order of `ArticulatedObject.part_mesh`."""
-    rows = [np.tile(visual.color[:3], (len(visual.mesh.faces), 1)) for visual in visuals]
-    return np.clip(np.concatenate(rows) * 255 + 0.5, 0, 255).astype(np.uint8)

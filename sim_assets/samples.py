@@ -87,7 +87,7 @@ class Shooter:
         """Open the object in the renderer, if there is one; `steps` does without."""
         self.renderer, self.thing, self.settings = renderer, thing, settings
         self.outline = Outline(thing)
-        self.surface = Surface(thing)
+        self.surface = Surface(thing, color=settings.color)
         parts = len(thing.visuals)
         self.least = min(LEAST_POINTS, max(1, settings.points // (4 * parts)))
         self.asked = least_points(settings.preset, settings.protocol, parts, settings.points)

@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from scapo.camera import Intrinsics
 from sim_assets.articulated import ArticulatedObject, Visual
 from sim_assets.renderer import BACKGROUND, AbstractRenderer, Frame, RenderError
+from sim_assets.textures import one_per_side, read_texels, texture_of
 
 os.environ.setdefault("LP_NUM_THREADS", "1")  # of Mesa's CPU driver: one process per core is faster
 with warnings.catch_warnings():
@@ -33,6 +34,7 @@ with warnings.catch_warnings():
         RenderCameraComponent,
         RenderMaterial,
         RenderShapeTriangleMesh,
+        RenderTexture2D,
     )
 
 SHADER = Path(__file__).parent / "shaders" / "depth"
@@ -207,11 +209,39 @@ def _entity(visuals: tuple[Visual, ...], color: bool) -> sapien.Entity:
 
 
 def make_shapes(visuals: tuple[Visual, ...], color: bool) -> list[RenderShapeTriangleMesh]:
-    """A part's surfaces: a shape per colour, or one for all, which is one draw call."""
+    """A part's surfaces: a shape per colour or texture, or one for all, which is one draw call."""
+    faces = [np.asarray(visual.mesh.faces) for visual in visuals]
     closed = _closed(visuals)
-    if color:
-        return [_shape([visual], closed, visual.color) for visual in visuals]
-    return [_shape(visuals, closed)]
+    if not color:
+        starts = np.cumsum([0] + [len(visual.mesh.vertices) for visual in visuals[:-1]])
+        every = np.concatenate([part + start for part, start in zip(faces, starts, strict=True)])
+        both = every if closed else np.concatenate([every, every[:, ::-1]])
+        return [_shape(visuals, both, RenderMaterial())]
+    textures: dict[int, RenderTexture2D] = {}
+    return [
+        _shape([visual], shown, _material(visual, textures))
+        for visual, shown in zip(visuals, faces if closed else one_per_side(visuals), strict=True)
+        if len(shown)
+    ]
+
+
+def _material(visual: Visual, textures: dict[int, RenderTexture2D]) -> RenderMaterial:
+    """Of one visual; `textures` are those that the device has already, by material."""
+    made = RenderMaterial()
+    made.base_color = [*visual.color]
+    found = texture_of(visual)
+    if found is None:
+        return made
+    name = id(found.material)
+    if name not in textures:
+        texels = read_texels(found.material)
+        if texels is None:
+            return made
+        opaque = np.pad(texels, ((0, 0), (0, 0), (0, 1)), constant_values=255)
+        # sRGB all along, as flat colours are; one level, as in `textures.look_up`.
+        textures[name] = RenderTexture2D(opaque, "R8G8B8A8Unorm")
+    made.base_color_texture = textures[name]
+    return made
 
 
 def find_reach(thing: ArticulatedObject) -> float:
@@ -242,22 +272,23 @@ def _closed(visuals: Sequence[Visual]) -> bool:
 
 
 def _shape(
-    visuals: Sequence[Visual], closed: bool, color: tuple[float, ...] = (0.7, 0.7, 0.7, 1.0)
+    visuals: Sequence[Visual], faces: Int[np.ndarray, "F 3"], material: RenderMaterial
 ) -> RenderShapeTriangleMesh:
-    """Surfaces as one shape, with all faces once more the other way round unless closed."""
-    starts = np.cumsum([0] + [len(visual.mesh.vertices) for visual in visuals[:-1]])
-    faces = np.concatenate(
-        [visual.mesh.faces + start for visual, start in zip(visuals, starts, strict=True)]
-    )
-    if not closed:
-        faces = np.concatenate([faces, faces[:, ::-1]])
+    """Surfaces as one shape; faces count their vertices one after the other."""
     points = np.concatenate([visual.mesh.vertices for visual in visuals]).astype(np.float32)
-    material = RenderMaterial()
-    material.base_color = list(color)
     return RenderShapeTriangleMesh(
         vertices=points,
         triangles=faces.astype(np.uint32),
         normals=np.zeros_like(points),
-        uvs=np.zeros((len(points), 2), np.float32),
+        uvs=np.concatenate([_coordinates(visual) for visual in visuals]),
         material=material,
     )
+
+
+def _coordinates(visual: Visual) -> Float[np.ndarray, "V 2"]:
+    """Of the texture, v downwards."""
+    found = texture_of(visual)
+    if found is None:
+        return np.zeros((len(visual.mesh.vertices), 2), np.float32)
+    uv = np.asarray(found.uv, float)
+    return np.stack([uv[:, 0], 1 - uv[:, 1]], -1).astype(np.float32)

@@ -37,7 +37,8 @@ def two_sided(
     shell, closed = _shells(welded)
     volumes = np.einsum("ij,ij->i", vertices[faces[:, 0]], np.cross(*_sides(vertices, faces)))
     volume = np.bincount(shell, volumes)
-    inward = (closed & (volume < 0))[shell]
+    least = -np.bincount(shell, np.abs(volumes)) * 1e-9  # a panel's two faces enclose nothing
+    inward = (closed & (volume < least))[shell]
     faces = np.where(inward[:, None], faces[:, ::-1], faces)
     reverse = _without_reverse(welded) & ~closed[shell]
     return np.concatenate([faces, faces[reverse][:, ::-1]])
@@ -84,16 +85,62 @@ def _shells(
     return shell, broken == 0
 
 
+def fronts_and_backs(
+    vertices: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    second: Bool[np.ndarray, " F"],
+) -> tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]:
+    """The face that a viewer in front of each face sees there, and that one behind it sees.
+
+    Models have panels with one material in front and another at the back, and the same triangle in
+    two files; which of several at one place is meant to be seen is then a matter of the side, of
+    those that were in a file before those that only are the reverse of one, and of their order.
+
+    Args:
+        vertices: Any unit.
+        faces: Vertex indices.
+        second: Faces that give way to others.
+
+    Returns:
+        Two faces each; the second is -1 where none looks that way.
+    """
+    forward, backward = _wound(_weld(vertices)[faces])
+    group = np.unique(np.concatenate([forward, backward]), axis=0, return_inverse=True)[1]
+    front, back = group.reshape(2, -1)
+    worst_first = np.lexsort((np.arange(len(faces)), second))[::-1]
+    best = np.full(2 * len(faces), -1)
+    best[front[worst_first]] = worst_first
+    return best[front], best[back]
+
+
+def are_added_reverses(faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    """Faces of one mesh whose reverse, over the same vertices, comes before them."""
+    forward, backward = _wound(faces)
+    group = np.unique(np.concatenate([forward, backward]), axis=0, return_inverse=True)[1]
+    front, back = group.reshape(2, -1)
+    first = np.full(2 * len(faces), len(faces))
+    np.minimum.at(first, front, np.arange(len(faces)))
+    return first[back] < np.arange(len(faces))
+
+
 def _without_reverse(faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
     """Faces whose mirror twin (the same corners run the other way) is not in the mesh."""
     if len(faces) == 0:
         return np.zeros(0, bool)
+    both = np.concatenate(_wound(faces))
+    group = np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)
+    return ~np.isin(group[len(faces) :], group[: len(faces)])
+
+
+def _wound(
+    faces: Int[np.ndarray, "F 3"],
+) -> tuple[Int[np.ndarray, "F 3"], Int[np.ndarray, "F 3"]]:
+    """Each face and its reverse, both from the lowest corner on."""
     turn = faces.argmin(1)
     first = np.take_along_axis(faces, turn[:, None], 1)
     second = np.take_along_axis(faces, (turn[:, None] + 1) % 3, 1)
     third = np.take_along_axis(faces, (turn[:, None] + 2) % 3, 1)
-    forward = np.concatenate([first, second, third], 1)
-    backward = np.concatenate([first, third, second], 1)
-    both = np.concatenate([forward, backward])
-    group = np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)
-    return ~np.isin(group[len(faces) :], group[: len(faces)])
+    return (
+        np.concatenate([first, second, third], 1),
+        np.concatenate([first, third, second], 1),
+    )
