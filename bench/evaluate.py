@@ -123,9 +123,6 @@ def _report(
         **{name: getattr(run, name) for name in Run.__slots__},
         "supervision": list(header.supervision),
         "budget": header.budget,
-        "run": header.run,
-        "commit": commit(),
-        "machine": machine(),
         "parts": list(split.manifest.parts),
         "joints": [joint.kind for joint in split.manifest.joints],
         "settings": asdict(request.settings),
@@ -145,15 +142,17 @@ def _report(
             "data": split.manifest.digest,
             "predictions": sha256_file(request.predictions),
         },
-        "versions": _versions(),
+        **_origin(header),
         "instance": instance.tolist(),
         **summarise(errors, instance, request.settings.ap_rule),
     }
 
 
-def _versions() -> dict[str, str]:
-    return {
+def _origin(header: Header) -> dict[str, Any]:
+    """What made the predictions, and what scored them."""
+    versions = {
         "scapo": version("scapo"),
         "numpy": np.__version__,
         "python": platform.python_version(),
     }
+    return {"run": header.run, "commit": commit(), "machine": machine(), "versions": versions}

@@ -22,6 +22,7 @@ from bench.score_files import COLUMNS
 from bench.scores import Settings
 from bench.verbs import VERBS
 from scapo import categories
+from scapo.provenance import commit, machine
 from scapo.store import Split, StoreError
 
 CATEGORIES = ("laptop", "eyeglasses", "drawer")
@@ -151,6 +152,7 @@ def test_the_csv_is_what_the_contract_says_and_the_same_bytes_twice(laptop, tmp_
     assert mean["mean"] == pytest.approx(rows["value"].mean(), rel=1e-6)
     assert mean["low"] <= mean["mean"] <= mean["high"]
     assert report["digests"]["data"] == laptop.manifest.digest
+    assert (report["commit"], report["machine"]) == (commit(), machine())
     assert len(report["instance"]) == 11
 
 
