@@ -33,6 +33,7 @@ from scapo.discovery import (
     trust_order,
 )
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
+from scapo.pictures import PictureData
 from scapo.placed import nearest_weights, placed_prediction, slides
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
 from scapo.points import Similarity, farthest_points, gather, nearest, normalise
@@ -44,6 +45,7 @@ from scapo.pose_search import (
     tournament,
 )
 from scapo.pseudo_placements import PseudoPlacements
+from scapo.registered_pictures import template_pictures
 from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
 from scapo.state_range import StateRange, range_of
@@ -200,6 +202,15 @@ class RegisteredScapo(AbstractMethod):
             shift=votes.shift * slides(self.template),
         )
         return placement, (votes, weight.mean(1).view(count, 4))
+
+    def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
+        """The template over its states, and where the network places it."""
+        del stage
+        points, _ = normalise(without_strays(observation.points))
+        kept = gather(points, farthest_points(points, self.config.points))
+        placement, (_, sure) = self._hypotheses(kept)
+        row = torch.arange(len(points), device=points.device) * 4 + sure.argmax(1)
+        return template_pictures(self.template, self._states(), kept, placement.take(row))
 
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:

@@ -103,3 +103,18 @@ def test_the_known_camera_moves_with_the_cloud():
     expected = turn @ plain.camera_T_part[:, 0, :3, :3]
     angles = rotation_angle(turned.camera_T_part[:, 0, :3, :3], expected).rad2deg()
     assert angles.median() < 1
+
+
+def test_pictures_show_the_template_on_the_clouds():
+    method, observation = trained()
+    with torch.no_grad():
+        shown = method.pictures(Observation(points=observation.points[:3]), "votes")
+    assert {name: len(data.panels) for name, data in shown.items()} == {
+        "template": 3,
+        "canonical": 3,
+        "reconstruction": 3,
+    }
+    first = shown["reconstruction"].panels[0]
+    assert first.beneath is not None
+    gap = squared_distances(first.beneath[None], first.points[None]).sqrt()
+    assert gap.median() < 0.2
