@@ -18,10 +18,15 @@ from typing import Any, Literal, get_args
 from scapo.files import write_bytes
 from scapo.jobs import Outcome, Pool, Report
 from scapo.types import JointKind, JointSpec
+from sim_assets.articulated import ArticulatedObject
 from sim_assets.files import SourceFiles
 from sim_assets.library import find
+from sim_assets.options import DataOptions
 from sim_assets.reader import Model, load, read
 from sim_assets.reduce import Candidate, candidates
+from sim_assets.renderer import make_renderer
+from sim_assets.request import make_request
+from sim_assets.samples import Shooter, ViewError
 from sim_assets.validate import AssetError, Repairs, refuse
 
 FORMAT = "scapo-check/1"
@@ -175,6 +180,7 @@ def check_one(urdf: Path, root: Path, options: Options) -> Result:
                 scale=options.scale,
                 root=root,
             )
+            show(urdf, thing)
             joints, said = thing.origin.joint_names, thing.origin.repairs
             triangles = sum(len(visual.mesh.faces) for part in thing.visuals for visual in part)
     except AssetError as error:
@@ -182,6 +188,21 @@ def check_one(urdf: Path, root: Path, options: Options) -> Result:
         return Result(path=str(urdf), status="refused", reason=reason, repairs=said)
     status: Status = "repaired" if said else "accepted"
     return Result(path=str(urdf), status=status, repairs=said, joints=joints, triangles=triangles)
+
+
+def show(urdf: Path, thing: ArticulatedObject) -> None:
+    """Make one sample, as `generate` would; by ray casting, which draws the same everywhere.
+
+    Raises:
+        AssetError: No view shows enough of every part.
+    """
+    request, _ = make_request(thing.category.name, DataOptions(count=1, backend="raycast"))
+    with make_renderer("raycast") as renderer:
+        try:
+            list(Shooter(renderer, thing, request.settings).shots([("check",)]))
+        except ViewError as error:
+            reason = str(error).removeprefix(f"{thing.instance}: expected ")
+            raise AssetError(f"{urdf}: expected {reason}") from error
 
 
 def _general(urdf: Path, root: Path, repairs: Repairs) -> tuple[tuple[str, ...], int]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,6 +111,13 @@ def histograms(split: Split) -> list[str]:
     per_object = np.bincount(data["instance"], minlength=len(manifest.instances))
     lines.append(f"  per object {per_object.min()} to {per_object.max()} samples")
     return lines
+
+
+def describe_state(state: float, kind: str) -> str:
+    """A joint's state with its unit, a dash where it is not known."""
+    if not math.isfinite(state):
+        return "–"
+    return f"{math.degrees(state):.0f}°" if kind == "revolute" else f"{100 * state:.0f} cm"
 
 
 def histogram(name: str, values: Float[np.ndarray, " K"], unit: str) -> str:

@@ -17,7 +17,7 @@ from scapo.draw import PART_COLORS, draw_axis, draw_cloud
 from scapo.layout import UNLABELLED
 from scapo.manifest import Manifest
 from scapo.store import Split, StoreError, write_bytes
-from sim_assets.info import find_splits
+from sim_assets.info import describe_state, find_splits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,7 +139,7 @@ def _draw(axes: Axes, tile: Tile) -> None:
     for pivot, axis in zip(tile.pivot, tile.axis, strict=True):
         draw_axis(axes, tile.points, pivot, axis, color=AXIS)
     states = [
-        f"{math.degrees(state):.0f}°" if joint.kind == "revolute" else f"{100 * state:.0f} cm"
+        describe_state(float(state), joint.kind)
         for joint, state in zip(tile.manifest.joints, tile.state, strict=True)
     ]
     axes.text(0.04, 0.03, f"{tile.number}", transform=axes.transAxes, fontsize=6, color=FAINT)

@@ -20,7 +20,7 @@ from scapo.draw import BACKGROUND, PART_COLORS
 from scapo.manifest import Manifest
 from scapo.store import Split
 from sim_assets.articulated import ArticulatedObject
-from sim_assets.info import find_splits
+from sim_assets.info import describe_state, find_splits
 from sim_assets.recover import RecoverError, recover
 from sim_assets.view_scene import Shown, Stage, look
 
@@ -213,8 +213,7 @@ class Viewer:
             for name, share in zip(manifest.parts, row["visible"], strict=True)
         )
         states = ", ".join(
-            f"{manifest.parts[joint.child]} {value * _unit(joint.kind)[0]:.1f} "
-            f"{_unit(joint.kind)[1]}"
+            f"{manifest.parts[joint.child]} {describe_state(float(value), joint.kind)}"
             for joint, value in zip(manifest.joints, row["joint_state"], strict=True)
         )
         lines = [

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from sim_assets.check import Options, check, check_one, exit_code, report, write_report
 from sim_assets.validate import AssetError
@@ -49,6 +50,15 @@ def test_with_a_category(tmp_path: Path):
     assert result.status == "accepted"
     assert check_one(urdf, tmp_path, Options(category="drawer")).status == "refused"
     assert check_one(urdf, tmp_path, Options(category="oven", up="q")).status == "refused"
+
+
+def test_a_part_that_cannot_be_seen(tmp_path: Path):
+    """A door of half a millimetre reads well, but no view gives it its points."""
+    urdf = cabinet(tmp_path)
+    trimesh.creation.box((0.0005, 0.0005, 0.0005)).export(tmp_path / "meshes/door.obj")
+    result = check_one(urdf, tmp_path, Options(category="oven"))
+    assert result.status == "refused"
+    assert "visible pixels" in result.reason
 
 
 def test_nothing_that_moves(tmp_path: Path):

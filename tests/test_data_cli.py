@@ -17,7 +17,7 @@ from scapo.categories import CATEGORIES
 from sim_assets import verbs
 from sim_assets.__main__ import main
 from sim_assets.console import RateColumn, progress_bar, watched
-from sim_assets.info import histogram
+from sim_assets.info import describe_state, histogram
 from sim_assets.preview import draw_preview
 from sim_assets.verbs import VERBS
 
@@ -163,6 +163,12 @@ def test_a_histogram_in_one_line():
     assert "0 █" in line
     assert "▄ 1 m, mean 0.3333" in line
     assert "5 deg, mean 5" in histogram("constant", np.full(3, 5.0), "deg")
+
+
+def test_states_in_words():
+    assert describe_state(np.pi / 2, "revolute") == "90°"
+    assert describe_state(0.123, "prismatic") == "12 cm"
+    assert describe_state(float("nan"), "revolute") == "–"
 
 
 def test_preview_draws_a_png(data, tmp_path, capsys):
