@@ -24,6 +24,8 @@ from scapo.template import ArticulatedTemplate, Placement
 
 CHUNK = 256
 """Hypotheses refined at once."""
+VIEWS = 64
+"""Views searched at once: each has `SearchSpace.keep` hypotheses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,7 +180,15 @@ def best_of(placement: Placement, loss: Float[Tensor, " H"], count: int) -> Foun
 
 def search(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Finalists:
     """The best placements of every view over all rotations and states."""
-    return tournament(template, views, propose(template, views, space))
+    found = [
+        tournament(template, some, propose(template, some, space))
+        for index in torch.arange(len(views.points), device=views.points.device).split(VIEWS)
+        for some in [views.take(index)]
+    ]
+    return Finalists(
+        placement=Placement.cat([part.placement for part in found]),
+        loss=torch.cat([part.loss for part in found]),
+    )
 
 
 ROUNDS = (
