@@ -48,8 +48,11 @@ class DiscoveryConfig:
     """Share of the searched views that each round keeps."""
     starts: int = 3
     """Candidate axes of each joint that are optimised; two of each where joints are several."""
-    contenders: int = 4
-    """Starts of least loss that search `judged` views; the one that explains them best goes on."""
+    draws: int = 3
+    """Sets of seeds: how many of their poses agree is a matter of luck."""
+    contenders: int = 2
+    """Starts of each set, those of least loss, that search `judged` views; the one that explains
+    them best goes on."""
     judged: int = 48
     template_points: int = 400
 
@@ -216,10 +219,10 @@ def search_all(
 def winner(
     tried: list[tuple[ArticulatedTemplate, Trusted]], views: Views, config: DiscoveryConfig
 ) -> tuple[ArticulatedTemplate, Trusted]:
-    """The start that explains views best which it has not seen, among the first few."""
+    """The start that explains best other views than those it was made from."""
     some = views.take(evenly(len(views.points), config.judged))
     losses = []
-    for template, trusted in tried[: config.contenders]:
+    for template, trusted in tried:
         found = search_all(template, some, trusted, config)
         losses.append(float(found.best().loss.mean()))
     return tried[min(range(len(losses)), key=losses.__getitem__)]
@@ -229,9 +232,12 @@ def discover(
     views: Views, kinds: tuple[JointKind, ...], config: DiscoveryConfig, generator: torch.Generator
 ) -> tuple[ArticulatedTemplate, Trusted]:
     """The articulated template of views of one category, with the views it was fitted to."""
-    seeds = evenly(len(views.points), config.seeds)
-    posed = common_frame(views.take(seeds), config)
-    template, trusted = winner(starts(posed, kinds, config, generator), views, config)
+    tried = []
+    for draw in range(config.draws):
+        seeds = (evenly(len(views.points), config.seeds) + 3 * draw) % len(views.points)
+        posed = common_frame(views.take(seeds), config)
+        tried += starts(posed, kinds, config, generator)[: config.contenders]
+    template, trusted = winner(tried, views, config)
     searched = views.take(evenly(len(views.points), config.searched))
     for share in config.trusted:
         finalists = search_all(template, searched, trusted, config)

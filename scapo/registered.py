@@ -81,6 +81,7 @@ class RegisteredScapo(AbstractMethod):
     """The articulated template, the network that votes for its placement, and their training."""
 
     name: ClassVar[str] = "registered"
+    networks: ClassVar[tuple[str, ...]] = ("network",)
     supervision: frozenset[Supervision] = frozenset()
 
     def __init__(
