@@ -68,17 +68,12 @@ def measure(request: Request) -> Explanation:
     instance = np.concatenate(instances)
     joined: dict[Rung, Errors] = {rung: _joined(found) for rung, found in rungs.items()}
     values = {name: np.concatenate([block[name] for block in seen]) for name in seen[0]}
-    ladder: Ladder = {
-        rung: {key: interval(table, instance) for key, table in errors.items()}
-        for rung, errors in joined.items()
-    }
-    medians: dict[Rung, dict[tuple[str, str], float]] = {
-        rung: {key: _median(table) for key, table in errors.items()}
-        for rung, errors in joined.items()
-    }
     words = (header.method, header.variant, header.category, header.split)
     return Explanation(
-        medians=medians,
+        medians={
+            rung: {key: _median(table) for key, table in errors.items()}
+            for rung, errors in joined.items()
+        },
         facts={
             "samples": f"{len(instance)} of {len(np.unique(instance))} objects",
             "seed": str(header.seed),
@@ -87,7 +82,10 @@ def measure(request: Request) -> Explanation:
         },
         title=" ".join(word for word in words if word),
         strata=tuple(stratify(joined["predicted"], values, instance)),
-        ladder=ladder,
+        ladder={
+            rung: {key: interval(table, instance) for key, table in errors.items()}
+            for rung, errors in joined.items()
+        },
     )
 
 

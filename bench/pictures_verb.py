@@ -20,9 +20,8 @@ from bench.prepare import Request
 from bench.ranking import ranking_picture
 from bench.template_picture import template_picture
 from bench.template_shape import template_shape
-from scapo.discovery import evenly
 from scapo.files import Header
-from scapo.method import AbstractMethod
+from scapo.method import AbstractMethod, evenly
 from scapo.store import StoreError
 
 CURVE = "metrics.jsonl"

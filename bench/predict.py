@@ -22,9 +22,8 @@ from bench.oracle import OracleMethod
 from bench.predictions import Header, write_predictions
 from bench.train import pick_device
 from scapo.data import SampleDataset, label, observe
-from scapo.discovery import evenly
 from scapo.files import Arrays
-from scapo.method import AbstractMethod, Mode
+from scapo.method import AbstractMethod, Mode, evenly
 from scapo.resident import map_labels
 from scapo.run_folder import TIMING
 from scapo.store import open_split

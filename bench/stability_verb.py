@@ -23,9 +23,8 @@ from bench.stability import SHIFT, Plan, Timed, equivariance, resampled, summary
 from bench.train import pick_device
 from bench.truth import revolute
 from scapo.data import SampleDataset
-from scapo.discovery import evenly
 from scapo.files import Header
-from scapo.method import AbstractMethod, Mode
+from scapo.method import AbstractMethod, Mode, evenly
 from scapo.provenance import commit, machine
 from scapo.store import Split, open_split, write_bytes
 from scapo.types import Observation
