@@ -53,7 +53,7 @@ class Found:
 
 def state_grid(states: Float[Tensor, "J S"]) -> Float[Tensor, "C J"]:
     """All combinations of the joints' states."""
-    return torch.tensor(list(product(*states.tolist())))
+    return torch.tensor(list(product(*states.tolist()))).to(states)
 
 
 @torch.no_grad()
@@ -76,7 +76,7 @@ def coarse_cost(
     move = move / facing.sum(-1, keepdim=True).clamp_min(1e-6)
     turned = (view.points[:, :count] @ rotation.mT)[None]
     turned_normals = (view.normals[:, :count] @ rotation.mT)[None].expand(len(points), -1, -1, -1)
-    sets = torch.arange(len(points))
+    sets = torch.arange(len(points), device=points.device)
     match = turned.new_zeros(())
     for sharpness in (20.0, 60.0, 140.0):
         placed = turned + move[:, :, None]
@@ -100,8 +100,8 @@ def coarse_cost(
 def propose(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Placement:
     """The `space.keep` best distinct placements of each view on the grid, view by view."""
     states = state_grid(space.states)
-    turn = torch.eye(3).expand(len(states), 3, 3)
-    posed = template.place(Placement.at(turn, torch.zeros(len(states), 3), states))
+    turn = torch.eye(3).to(states).expand(len(states), 3, 3)
+    posed = template.place(Placement.at(turn, states.new_zeros(len(states), 3), states))
     grid = NearestGrid.build(*posed)
     found = []
     for b in range(len(views.points)):

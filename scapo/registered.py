@@ -122,13 +122,18 @@ class RegisteredScapo(AbstractMethod):
         """Find the template, and its placement in the clouds that the network will learn."""
         del stage, labels
         index = evenly(len(observation.points), self.config.learned)
-        cloud = observation.points[index]
+        cloud = observation.points[index.to(observation.points.device)].cpu()
         belonging = belongs(cloud)
         points, similarity = normalise(replaced(cloud, belonging))
         camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
         views = observe(points, camera, count=self.config.points)
-        self._set_pseudo(cloud[:, 0], views, self._discover(views, generator))
+        device = self.template.points.device
+        self.template.cpu()  # many small steps, view by view: no work for a GPU
+        seed = torch.randint(2**31, (1,), generator=generator, device=generator.device)
+        found = self._discover(views, torch.Generator().manual_seed(int(seed)))
+        self._set_pseudo(cloud[:, 0], views, found)
         self.pseudo.belonging = belonging
+        self.to(device)
 
     def _discover(self, views: Views, generator: torch.Generator) -> Found:
         template, trusted = discover(views, self.template.kinds, self.config.discovery, generator)
@@ -139,7 +144,7 @@ class RegisteredScapo(AbstractMethod):
 
     def _set_pseudo(self, key: Tensor, views: Views, found: Found) -> None:
         order = trust_order(found)
-        trust = torch.zeros(len(order))
+        trust = torch.zeros(len(order), device=order.device)
         trust[order[: max(8, round(self.config.trusted * len(order)))]] = 1.0
         placement = found.placement
         away = views.camera - placement.translation
@@ -221,7 +226,8 @@ class RegisteredScapo(AbstractMethod):
         kept = gather(clean, farthest_points(clean, self.config.points))
         placement, (votes, sure) = self._hypotheses(kept)
         best = sure.argmax(1)
-        row = torch.arange(len(points)) * 4 + best
+        every = torch.arange(len(points), device=points.device)
+        row = every * 4 + best
         confidence = sure.gather(1, best[:, None])[:, 0]
         if mode == "fast":
             near = nearest(points, kept)
@@ -229,7 +235,7 @@ class RegisteredScapo(AbstractMethod):
             chosen = placement.take(row)
         else:
             camera = self._camera(observation, similarity, placement.take(row), votes.camera[row])
-            frame = principal_frames(kept)[torch.arange(len(kept)), best]
+            frame = principal_frames(kept)[every, best]
             chosen, confidence = self._refined(clean, camera, frame, placement)
             weight = nearest_weights(self.template, points, chosen, camera)
         return placed_prediction(self.template, chosen, weight, similarity, confidence)

@@ -79,7 +79,7 @@ def narrowest(
         kinds: Of the joints.
     """
     state = placement.state.unflatten(0, loss.shape)
-    best = state[torch.arange(len(loss)), loss.argmin(1)]
+    best = state[torch.arange(len(loss), device=loss.device), loss.argmin(1)]
     chosen = range_of(best, kinds)
     for j in list(range(len(kinds))) * (2 if len(kinds) > 1 else 1):
         span = (chosen.high[j] - chosen.low[j]).clamp_min(1e-3)
