@@ -36,8 +36,6 @@ class FitOptions:
     """Of the robust distance, per squared normalised length, at the beginning and the end."""
     points: int = 128
     """Of each view, drawn anew every step."""
-    shared: bool = True
-    """Whether template and joints move, or the placements alone."""
     rate: float = 1.0
     backward: float = 1.0
     """Weight of what the camera should have seen."""
@@ -162,13 +160,13 @@ def fit(
     states: Float[Tensor, "J S"] | None = None,
     generator: torch.Generator,
 ) -> tuple[Placement, Float[Tensor, " B"]]:
-    """Improve the placements of all views, and the template with them if `options.shared`.
+    """Improve the template, its joints and the placements of all views together.
 
     Returns:
         The placements and the loss of each view at the last step.
     """
     free = _Free(start, template, options.rate)
-    groups = [*free.groups, *(_shared_groups(template, options.rate) if options.shared else [])]
+    groups = [*free.groups, *_shared_groups(template, options.rate)]
     optimiser = torch.optim.Adam(groups, betas=(0.8, 0.95))
     rates = [group["lr"] for group in groups]
     loss = start.translation.new_zeros(len(start.translation))

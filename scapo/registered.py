@@ -4,9 +4,8 @@
 Training. Views of the category are registered and fitted jointly into one articulated template
 (`discovery`), which is then searched for in the training views; a small network (`point_votes`)
 learns the placements of the trusted ones. Points that a mask let in (`stray_points`) are left out.
-No label is used anywhere: starts, hypotheses and trust
-are chosen by the loss of the views alone. Camera positions of the training clouds are known (their
-frame's origin).
+No label is used anywhere: starts, hypotheses and trust are chosen by the loss of the views alone.
+Camera positions of the training clouds are known (their frame's origin).
 
 `fast` is the network alone, which sees the points only; `refine` fits the template to the cloud
 from the network's four hypotheses and the best of a grid. For that it asks where the camera was:
