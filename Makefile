@@ -42,7 +42,7 @@ format: setup ## ruff, writing
 	@$(BIN)/ruff format .
 
 bench: setup ## speed tests
-	@$(BIN)/python -m pytest tests/speed --benchmark-enable --benchmark-only --benchmark-columns=min,median,rounds \
+	@$(BIN)/python -m pytest tests/speed --benchmark-enable --benchmark-columns=min,median,rounds \
 	  --jaxtyping-packages= -p no:xdist $(ARGS)
 
 lock: setup ## resolve pyproject.toml anew into the lock files (ARGS=--upgrade)

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from scapo import geometry
 from scapo.method import AbstractMethod
 from scapo.model import Scapo
-from scapo.placed import base_centre
 from scapo.registered import RegisteredScapo
 
 
@@ -40,7 +39,7 @@ def template_shape(method: AbstractMethod) -> TemplateShape | None:
 
 def _registered(method: RegisteredScapo) -> TemplateShape:
     template = method.template
-    origin = base_centre(template)
+    origin = template.part_centres()[0]
     return TemplateShape(
         points=_plain(template.points - origin),
         weight=_plain(template.logit.softmax(-1)),

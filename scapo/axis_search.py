@@ -10,7 +10,7 @@ free for each pair, so no state need be known.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import roma
 import torch
@@ -21,7 +21,7 @@ from torch import Tensor
 from scapo.part_evidence import gather_evidence, spread
 from scapo.registration import HIDDEN_COST, NORMAL_WEIGHT, NearestGrid
 from scapo.sightings import Views, free_and_hidden
-from scapo.template import PartPoses
+from scapo.template import ArticulatedTemplate, PartPoses, Placement
 from scapo.types import JointKind
 
 
@@ -70,7 +70,31 @@ def principal_frame(
     Shapes without such directions get the best there is: any frame will do for them.
     """
     aligned = torch.stack([(normals @ r.T).abs().amax(-1) for r in rotations])
-    frame = rotations[torch.exp(-8 * (1 - aligned)).mean(-1).argmax()]
+    return _settled(normals, rotations[torch.exp(-8 * (1 - aligned)).mean(-1).argmax()])
+
+
+@torch.no_grad()
+def along_main_directions(template: ArticulatedTemplate, placement: Placement) -> Placement:
+    """Turn the template's frame to the main directions of its base that are nearest, in place.
+
+    While shape, axes and all placements are fitted together nothing holds the frame: the whole
+    template can turn in it. What is said of directions (axes along the main ones, scales along the
+    frame's) then means something else in every round.
+
+    Returns:
+        The placements of the turned template.
+    """
+    base = template.logit.argmax(-1) == 0
+    frame = _settled(template.normals[base], torch.eye(3).to(template.normals))
+    for vectors in (template.points, template.normals, template.axis, template.pivot):
+        vectors.copy_(vectors @ frame.T)
+    return replace(
+        placement, rotation=placement.rotation @ frame.T, shift=placement.shift @ frame.T
+    )
+
+
+def _settled(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """The orthogonal directions near those of `frame` that most normals follow."""
     for _ in range(20):
         projected = normals @ frame.T
         axis = projected.abs().argmax(-1)
@@ -79,7 +103,7 @@ def principal_frame(
         rows = torch.stack([(normals * weight)[axis == c].sum(0) for c in range(3)])
         u, _, vh = torch.linalg.svd(F.normalize(rows, dim=-1))
         frame = u @ vh
-    return frame * torch.tensor([[1.0], [1.0], [1.0]]).to(frame) * torch.linalg.det(frame).sign()
+    return frame * torch.linalg.det(frame).sign()
 
 
 def _amounts(kind: JointKind) -> Float[Tensor, " D"]:

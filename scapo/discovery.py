@@ -16,7 +16,14 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.axis_search import JointGuess, Posed, principal_frame, search_joint, still_evidence
+from scapo.axis_search import (
+    JointGuess,
+    Posed,
+    along_main_directions,
+    principal_frame,
+    search_joint,
+    still_evidence,
+)
 from scapo.consensus import agree
 from scapo.joint_fit import FitOptions, fit
 from scapo.method import evenly
@@ -24,6 +31,7 @@ from scapo.part_evidence import farthest_features, rebuild
 from scapo.pose_search import Finalists, Found, SearchSpace, search
 from scapo.registration import register_pairs, rotation_grid
 from scapo.sightings import Views
+from scapo.sliding_gauge import choose_axes
 from scapo.state_range import narrowest, range_of
 from scapo.template import ArticulatedTemplate, Placement
 from scapo.types import JointKind
@@ -109,18 +117,9 @@ def moved_sets(posed: Posed, joints: int, generator: torch.Generator) -> list[Bo
     return [moved & (label == k) for k in range(joints)]
 
 
-def candidate_axes(kind: JointKind) -> Float[Tensor, "A 3"]:
-    """The main directions; for slides, also those halfway between two."""
-    axes = torch.eye(3)
-    if kind == "revolute":
-        return axes
-    halfway = [[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1], [0, 1, 1], [0, 1, -1]]
-    return torch.cat([axes, F.normalize(torch.tensor(halfway, dtype=torch.float32), dim=-1)])
-
-
 def wide_states(kinds: tuple[JointKind, ...], count: int = 13) -> Float[Tensor, "J {count}"]:
     """All that a joint could do, before anything is known."""
-    ends = [1.7 if kind == "revolute" else 0.5 for kind in kinds]
+    ends = [1.7 if kind == "revolute" else 0.25 for kind in kinds]
     return torch.stack([torch.linspace(-end, end, count) for end in ends])
 
 
@@ -152,7 +151,7 @@ def starts(
     """A template for every combination of candidate axes, those with the least loss first."""
     moved = moved_sets(posed, len(kinds), generator)
     guesses = [
-        search_joint(posed, rows, kind, candidate_axes(kind), generator=generator)
+        search_joint(posed, rows, kind, torch.eye(3), generator=generator)
         for rows, kind in zip(moved, kinds, strict=True)
     ]
     none = torch.zeros(len(posed.rotation), len(kinds))
@@ -161,24 +160,31 @@ def starts(
     for combination in product(*[found[:each] for found in guesses]):
         template = first_template(posed, moved, combination, kinds, config.template_points)
         placement = Placement.at(posed.rotation, posed.translation, none)
-        for round_number in range(4):
-            sharpness = (60.0, 200.0) if round_number == 0 else (120.0, 300.0)
-            options = FitOptions(steps=30, sharpness=sharpness, search_states=(0, 15))
-            placement, _ = fit(
-                template,
-                posed.views,
-                placement,
-                options,
-                states=wide_states(kinds),
-                generator=generator,
-            )
-            rebuild(template, posed.views, placement, generator=generator)
-        placement, loss = fit(
-            template, posed.views, placement, FitOptions(steps=20), generator=generator
-        )
+        placement, loss = _first_rounds(template, posed.views, placement, generator)
         tried.append((float(loss.mean()), template, placement))
     tried.sort(key=lambda start: start[0])
     return [(t, Trusted(views=posed.views, placement=placement)) for _, t, placement in tried]
+
+
+def _first_rounds(
+    template: ArticulatedTemplate, views: Views, placement: Placement, generator: torch.Generator
+) -> tuple[Placement, Float[Tensor, " B"]]:
+    """Fit and rebuild a start; a sliding joint gets its axis after the first fit and keeps it."""
+    kinds, axis_weight = template.kinds, 0.0
+    states = wide_states(kinds)
+    for number in range(4):
+        options = FitOptions(
+            steps=30,
+            sharpness=(60.0, 200.0) if number == 0 else (120.0, 300.0),
+            search_states=(0, 15),
+            axis_weight=axis_weight,
+        )
+        placement, _ = fit(template, views, placement, options, states=states, generator=generator)
+        if number == 0 and "prismatic" in kinds:
+            placement, axis_weight = choose_axes(template, placement, torch.eye(3)), AXIS_WEIGHT
+        rebuild(template, views, placement, generator=generator)
+    options = FitOptions(steps=20, axis_weight=axis_weight)
+    return fit(template, views, placement, options, generator=generator)
 
 
 def trust_order(found: Found) -> Int[Tensor, " B"]:
@@ -194,6 +200,7 @@ def improve(
     states = range_of(placement.state, template.kinds).wider(0.25).grid(11)
     for number in range(rounds):
         rebuild(template, views, placement, generator=generator)
+        placement = along_main_directions(template, placement)
         search_at = (0,) if number < rounds // 2 else ()
         options = FitOptions(
             steps=25, sharpness=(150.0, 400.0), search_states=search_at, axis_weight=AXIS_WEIGHT

@@ -21,8 +21,10 @@ from torch import Tensor
 from scapo.points import gather
 from scapo.registration import NORMAL_WEIGHT
 from scapo.sightings import Views, free_and_hidden
-from scapo.template import ArticulatedTemplate, Placement
+from scapo.template import ArticulatedTemplate, Placement, slides
 
+SHIFTS = tuple(0.05 * k for k in range(-5, 6))
+"""Places of a sliding part across its joint's axis that are tried; the mean radius is 0.25."""
 NORMAL_LENGTH = 0.06
 """A unit of normal difference counts as this length when neighbours are sought."""
 
@@ -42,7 +44,10 @@ class FitOptions:
     search_states: tuple[int, ...] = ()
     """Steps at which every state is searched over `states`."""
     scale_weight: float = 0.05
-    shift_weight: float = 0.5
+    shift_weight: float = 0.2
+    slide_weight: float = 0.7
+    """Of a sliding joint's states about their mean: without it a part slides right through the body
+    to explain its far side."""
     axis_weight: float = 0.0
     """Pull of each joint axis to the nearest axis of the template frame, a Manhattan frame."""
 
@@ -102,20 +107,55 @@ def search_states(
     states: Float[Tensor, "J S"],
     sharpness: float,
 ) -> Placement:
-    """Each joint's best state of a grid, the others held, the present state among them."""
-    for j in range(states.shape[0]):
+    """Each joint's best state of a grid, the others held, the present state among them.
+
+    Of a sliding joint also its part's best place across the axis, of `SHIFTS`.
+    """
+    for j, kind in enumerate(template.kinds):
         here = placement.state[:, j : j + 1]
         tried = torch.cat([here, states[j].to(here).expand(len(here), -1)], 1)
-        loss = []
-        for column in tried.T:
-            state = placement.state.clone()
-            state[:, j] = column
-            placed = template.place(replace(placement, state=state))
-            loss.append(view_loss(views, placed, sharpness))
-        state = placement.state.clone()
-        state[:, j] = tried.gather(1, torch.stack(loss, 1).argmin(1, keepdim=True))[:, 0]
-        placement = replace(placement, state=state)
+        moved = torch.zeros_like(placement.state)
+        moved[:, j] = 1.0
+        options = [
+            replace(placement, state=placement.state + (column[:, None] - here) * moved)
+            for column in tried.T
+        ]
+        placement = _best_option(template, views, placement, options, sharpness)
+        if kind != "prismatic":
+            continue
+        for across in across_axis(template.directions()[j]):
+            place = placement.shift @ across
+            options = [placement]
+            for amount in SHIFTS:
+                step = (moved * (amount - place))[..., None] * across
+                options.append(replace(placement, shift=placement.shift + step))
+            placement = _best_option(template, views, placement, options, sharpness)
     return placement
+
+
+def across_axis(axis: Float[Tensor, " 3"]) -> Float[Tensor, "2 3"]:
+    """Two unit directions at right angles to an axis and each other, by the template's frame."""
+    least = F.one_hot(axis.abs().argmin(), 3).to(axis)
+    first = F.normalize(torch.linalg.cross(axis, least), dim=0)
+    return torch.stack([first, torch.linalg.cross(axis, first)])
+
+
+def _best_option(
+    template: ArticulatedTemplate,
+    views: Views,
+    placement: Placement,
+    options: list[Placement],
+    sharpness: float,
+) -> Placement:
+    """For each view the states and shifts of that of the placements which has the least loss."""
+    loss = [view_loss(views, template.place(option), sharpness) for option in options]
+    best = torch.stack(loss).argmin(0)
+    every = torch.arange(len(best), device=best.device)
+    return replace(
+        placement,
+        state=torch.stack([option.state for option in options])[best, every],
+        shift=torch.stack([option.shift for option in options])[best, every],
+    )
 
 
 class _Free:
@@ -128,9 +168,8 @@ class _Free:
         self.log_scale = start.log_scale.detach().clone().requires_grad_()
         self.state = start.state.detach().clone().requires_grad_()
         self.shift = start.shift.detach().clone().requires_grad_()
-        slides = torch.tensor([kind == "prismatic" for kind in template.kinds])
-        self.slides = slides.to(start.shift)[:, None]
-        state_rate = 0.01 if bool(slides.all()) else 0.03
+        self.slides = slides(template)
+        state_rate = 0.01 if bool(self.slides.all()) else 0.03
         rates = (
             (self.turn, 0.02),
             (self.translation, 0.004),
@@ -183,6 +222,7 @@ def fit(
                 template, some, free.placement(template.directions()), states, sharpness
             )
             free.state.data.copy_(found.state)
+            free.shift.data.copy_(found.shift)
         placement = free.placement(template.directions())
         loss = view_loss(some, template.place(placement), sharpness, options.backward)
         total = loss.mean() + _gauge(template, placement, options)
@@ -215,6 +255,8 @@ def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOpti
     gauge = gauge + 0.5 * scale.mean(0).square().sum()
     gauge = gauge + 0.02 * placement.state.mean(0).square().sum()
     gauge = gauge + options.shift_weight * placement.shift.square().sum((1, 2)).mean()
+    spread = (placement.state - placement.state.mean(0)).square() @ slides(template)
+    gauge = gauge + options.slide_weight * spread.mean()
     askew = 1 - template.directions().square().amax(-1)
     gauge = gauge + options.axis_weight * askew.sum()
     mass = template.logit.softmax(-1).mean(0)

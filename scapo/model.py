@@ -92,7 +92,7 @@ def cpu_config() -> ScapoConfig:
             part_mass=10.0,
             boundary_temperature=0.05,
         ),
-        epochs=(20, 20),
+        epochs=(16, 16),
         lr=(2e-3, 1e-3),
         batch=32,
     )

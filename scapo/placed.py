@@ -13,21 +13,8 @@ from scapo.geometry import rigid
 from scapo.joint_fit import oriented_nearest
 from scapo.points import Similarity
 from scapo.sightings import surface_normals
-from scapo.template import ArticulatedTemplate, Placement
+from scapo.template import ArticulatedTemplate, Placement, slides
 from scapo.types import Joints, Prediction
-
-
-def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:
-    """1 for each prismatic joint, 0 for the others."""
-    sliding = [[float(kind == "prismatic")] for kind in template.kinds]
-    return torch.tensor(sliding).to(template.points)
-
-
-def base_centre(template: ArticulatedTemplate) -> Float[Tensor, " 3"]:
-    """Middle of the box of the base's points (2 to 98 %), unscaled: the origin of part frames."""
-    base = template.points[template.logit.argmax(-1) == 0]
-    base = base if len(base) else template.points
-    return base.quantile(torch.tensor([0.02, 0.98]).to(base), 0).mean(0)
 
 
 @torch.no_grad()
@@ -48,7 +35,7 @@ def placed_prediction(
         confidence: Handed on.
     """
     poses = template.part_poses(placement)
-    origin = base_centre(template) * placement.log_scale.exp()
+    origin = template.part_centres()[0] * placement.log_scale.exp()
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]

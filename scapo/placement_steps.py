@@ -40,7 +40,9 @@ class StepOptions:
     """Asked whether the camera would have seen them."""
     backward: float = 1.0
     scale_weight: float = 0.05
-    shift_weight: float = 0.5
+    shift_weight: float = 0.2
+    slide_weight: float = 0.7
+    """Of a sliding joint's state, as in `joint_fit.FitOptions`."""
     damping: float = 0.02
 
 
@@ -189,9 +191,9 @@ def _priors(
 ) -> tuple[Float[Tensor, " D"], Float[Tensor, "H D"]]:
     """Weight of each coordinate's square in the loss, and the coordinate's value."""
     none = torch.zeros_like(placement.translation)
-    joints = len(template.kinds)
-    value = [none, none, placement.log_scale, torch.zeros_like(placement.state)]
-    weight = [0.0] * 6 + [options.scale_weight] * 3 + [0.0] * joints
+    value = [none, none, placement.log_scale, placement.state]
+    weight = [0.0] * 6 + [options.scale_weight] * 3
+    weight += [options.slide_weight * (kind == "prismatic") for kind in template.kinds]
     for j, kind in enumerate(template.kinds):
         if kind == "prismatic":
             value.append(placement.shift[:, j])

@@ -181,13 +181,25 @@ def best_of(placement: Placement, loss: Float[Tensor, " H"], count: int) -> Foun
 def search(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Finalists:
     """The best placements of every view over all rotations and states."""
     found = [
-        tournament(template, some, propose(template, some, space))
+        tournament(template, some, propose(template, some, space), space.states)
         for index in torch.arange(len(views.points), device=views.points.device).split(VIEWS)
         for some in [views.take(index)]
     ]
     return Finalists(
         placement=Placement.cat([part.placement for part in found]),
         loss=torch.cat([part.loss for part in found]),
+    )
+
+
+def _states_again(
+    template: ArticulatedTemplate, views: Views, placement: Placement, states: Float[Tensor, "J S"]
+) -> Placement:
+    some = thin(views, torch.arange(0, views.points.shape[1], 3, device=views.points.device))
+    return Placement.cat(
+        [
+            search_states(template, some.take(index), placement.take(index), states, 120.0)
+            for index in torch.arange(len(some.points), device=some.points.device).split(CHUNK)
+        ]
     )
 
 
@@ -199,11 +211,14 @@ ROUNDS = (
 """Of `tournament`: steps, and how many distinct hypotheses of a view go on."""
 
 
-def tournament(template: ArticulatedTemplate, views: Views, start: Placement) -> Finalists:
+def tournament(
+    template: ArticulatedTemplate, views: Views, start: Placement, states: Float[Tensor, "J S"]
+) -> Finalists:
     """The best of many hypotheses of each view (as many for each, one after the other).
 
     All are refined a little, the best distinct ones further, and fewer still to the end: right
-    hypotheses are seldom the best before refinement, and few steps tell the hopeless ones.
+    hypotheses are seldom the best before refinement, and few steps tell the hopeless ones. Those
+    that are left before the last steps try all `states` again.
     """
     count = len(views.points)
     first = torch.arange(count, device=views.points.device)
@@ -211,6 +226,8 @@ def tournament(template: ArticulatedTemplate, views: Views, start: Placement) ->
     for options, left in ROUNDS:
         number = len(placement.state) // count
         index = first.repeat_interleave(number)
+        if not left:
+            placement = _states_again(template, views.take(index), placement, states)
         placement, loss = refine(template, views.take(index), placement, options)
         if left:
             table = placement.rotation.unflatten(0, (count, number))

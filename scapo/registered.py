@@ -33,7 +33,7 @@ from scapo.discovery import (
 )
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
 from scapo.pictures import PictureData
-from scapo.placed import nearest_weights, placed_prediction, slides
+from scapo.placed import nearest_weights, placed_prediction
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
 from scapo.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.pose_search import (
@@ -49,7 +49,13 @@ from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
 from scapo.state_range import StateRange, range_of
 from scapo.stray_points import belongs, replaced, without_strays
-from scapo.template import ArticulatedTemplate, Placement, interleave, turn_placement
+from scapo.template import (
+    ArticulatedTemplate,
+    Placement,
+    interleave,
+    slides,
+    turn_placement,
+)
 from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
 
 
@@ -58,7 +64,7 @@ class RegisteredConfig:
     """SCAPO by registration and joint fit."""
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    learned: int = 600
+    learned: int = 1000
     """Training clouds whose placements the network learns, 0.25 s each on one core."""
     trusted: float = 0.85
     """Share of them that it learns from."""
@@ -266,7 +272,9 @@ class RegisteredScapo(AbstractMethod):
         start = [turn_placement(proposed, frame.repeat_interleave(4, 0))]
         if self.config.grid_hypotheses:
             start.append(propose(self.template, views, self._space()))
-        finalists = tournament(self.template, views, interleave(start, len(points)))
+        finalists = tournament(
+            self.template, views, interleave(start, len(points)), self._space().states
+        )
         found = finalists.best(self._states().wider(0.1))
         final = settle_states(self.template, views, found, self._states())
         return turn_placement(final, frame.mT), found.margin

@@ -144,13 +144,32 @@ class ArticulatedTemplate(nn.Module):
             normals = normals + share * (self.normals @ turn)
         return points, F.normalize(normals, dim=-1)
 
+    @torch.no_grad()
+    def part_centres(self) -> Float[Tensor, "P 3"]:
+        """Middle of the box of each part's points (2 to 98 %), unscaled; of all if it has none."""
+        part = self.logit.argmax(-1)
+        ends = torch.tensor([0.02, 0.98]).to(self.points)
+        own = [self.points[part == p] for p in range(self.logit.shape[1])]
+        filled = [points if len(points) else self.points for points in own]
+        return torch.stack([points.quantile(ends, 0).mean(0) for points in filled])
+
     def joints_in_view(
         self, placement: Placement
     ) -> tuple[Float[Tensor, "B J 3"], Float[Tensor, "B J 3"]]:
-        """Pivots and axes in the frame of every view."""
-        pivot = self.pivot * placement.log_scale.exp()[:, None] + placement.shift
+        """Pivots and axes in the frame of every view.
+
+        A sliding joint has no pivot of its own: the middle of its part stands for it.
+        """
+        pivot = torch.where(slides(self) > 0, self.part_centres()[1:], self.pivot)
+        pivot = pivot * placement.log_scale.exp()[:, None] + placement.shift
         pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
         return pivot, self.directions() @ placement.rotation.mT
+
+
+def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:
+    """1 for each prismatic joint, 0 for the others."""
+    sliding = [[float(kind == "prismatic")] for kind in template.kinds]
+    return torch.tensor(sliding).to(template.points)
 
 
 def turn_placement(placement: Placement, turn: Float[Tensor, "B 3 3"]) -> Placement:

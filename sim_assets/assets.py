@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 
 from sim_assets import procedural
 from sim_assets.articulated import ArticulatedObject
+from sim_assets.library import source_root
 from sim_assets.reader import find, instance_id, read, select
 
 
@@ -112,7 +113,7 @@ def folder_assets(
     Raises:
         AssetError: No such folder, or no model of this split in it.
     """
-    root = source if source.is_dir() else source.parent
+    root = source_root(source)
     return [
         UrdfAsset(urdf=urdf, root=root, category=category, up=up, front=front, scale=scale)
         for urdf in select(find(source), split, root)

@@ -20,7 +20,7 @@ from scapo.jobs import Outcome, Pool, Report
 from scapo.types import JointKind, JointSpec
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.files import SourceFiles
-from sim_assets.library import find
+from sim_assets.library import find, source_root
 from sim_assets.options import DataOptions
 from sim_assets.reader import Model, load, read
 from sim_assets.reduce import Candidate, candidates
@@ -94,7 +94,7 @@ def check(
         AssetError: No such folder, or no model in it.
     """
     options = options or Options()
-    root = path if path.is_dir() else path.parent
+    root = source_root(path)
     models = [_Model(urdf=urdf, root=root, options=options) for urdf in find(path)]
     results: dict[Path, Result] = {}
     pool: Pool[_Model, Result] = Pool(min(workers, len(models)), timeout=options.timeout)
@@ -138,7 +138,7 @@ def _job(model: _Model, send: Report) -> Result:
 
 def _result(outcome: Outcome[_Model, Result]) -> Result:
     model = outcome.job
-    name = model.urdf.relative_to(model.root).as_posix()
+    name = model.urdf.resolve().relative_to(model.root.resolve()).as_posix()
     result = outcome.result
     if result is None:
         reason = f"{name}: expected to be read, found that {outcome.reason}"

@@ -16,6 +16,8 @@ SHARES = {"train": 0.7, "val": 0.1, "test": 0.2}
 """By hash of the instance id, where the source has no splits of its own."""
 FEW = 10
 """Fewer models than this are not divided."""
+INNER = ("urdf", "urdfs", "robots")
+"""Folders in which a package keeps its URDFs, the meshes beside them."""
 PREFERRED = ("mobility.urdf", "model.urdf", "robot.urdf")
 VARIANT = re.compile(
     r"[_-](cvx|vhacd|convex|collision|fixed|static|repo|relabel|simple|simplified|orig|original"
@@ -47,6 +49,20 @@ def find(path: Path) -> list[Path]:
     if not found:
         raise refuse(path, "URDF files in the folder", "none")
     return sorted(found, key=lambda urdf: urdf.relative_to(path).parts)
+
+
+def source_root(source: Path) -> Path:
+    """The folder that holds all files of a source: below it meshes are found and ids are made.
+
+    Args:
+        source: A folder of models, or one `.urdf` file.
+
+    Returns:
+        The folder, or that of the file; of a package's own folder of URDFs, the package.
+    """
+    folder = source if source.is_dir() else source.parent
+    full = folder.resolve()
+    return full.parent if full.name in INNER and _siblings(full) else folder
 
 
 def _folders(path: Path) -> Iterator[tuple[Path, list[str]]]:

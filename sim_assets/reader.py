@@ -24,7 +24,7 @@ from sim_assets import frames
 from sim_assets.articulated import ArticulatedObject, Origin, Visual
 from sim_assets.files import SourceFiles
 from sim_assets.frames import Vector
-from sim_assets.library import find, instance_id, select
+from sim_assets.library import INNER, find, instance_id, select
 from sim_assets.meshes import load_links, remade
 from sim_assets.parse import parse
 from sim_assets.reduce import Reduction, Surfaces, exchanged, moved, reduce, reordered
@@ -143,7 +143,7 @@ def package_root(urdf: Path) -> Path:
     its parent.
     """
     folder = urdf.resolve().parent
-    return folder.parent.parent if folder.name in ("urdf", "urdfs", "robots") else folder
+    return folder.parent.parent if folder.name in INNER else folder
 
 
 def _resting(model: Model, reduction: Reduction, rests: tuple[Rest, ...]) -> _Resting:

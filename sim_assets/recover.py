@@ -8,6 +8,7 @@ from pathlib import Path
 from scapo.manifest import Instance, Manifest
 from sim_assets.articulated import ArticulatedObject
 from sim_assets.assets import Asset, ProceduralAsset, UrdfAsset
+from sim_assets.library import source_root
 
 
 class RecoverError(ValueError):
@@ -57,12 +58,13 @@ def _asset(manifest: Manifest, instance: Instance, source: Path | None) -> Asset
             raise RecoverError(
                 f"{instance.id}: expected the folder of models (--source), found none"
             )
-        urdf = source / instance.source
+        root = source_root(source)
+        urdf = root / instance.source
         if not urdf.is_file():
             raise RecoverError(f"{instance.id}: expected the model {urdf}, found none")
         return UrdfAsset(
             urdf=urdf,
-            root=source,
+            root=root,
             category=manifest.category,
             up=options.get("up"),
             front=options.get("front"),

@@ -3,13 +3,24 @@
 
 from __future__ import annotations
 
-import torch
-from sighted import AXIS, PIVOT, sighted
-from strategies import generator
+from dataclasses import replace
 
-from scapo.axis_search import Posed, principal_frame, search_joint, still_evidence
+import roma
+import torch
+from sighted import AXIS, PIVOT, sighted, template
+from strategies import generator
+from torch.testing import assert_close
+
+from scapo.axis_search import (
+    Posed,
+    along_main_directions,
+    principal_frame,
+    search_joint,
+    still_evidence,
+)
 from scapo.geometry import point_line_distance, random_rotations
 from scapo.registration import rotation_grid
+from scapo.template import Placement
 
 
 def posed(count: int, seed: int) -> Posed:
@@ -45,3 +56,20 @@ def test_the_frame_follows_most_normals():
     aligned = (frame @ turn).abs()
     assert aligned.amax(1).min() > 0.995
     assert torch.allclose(torch.linalg.det(frame), torch.tensor(1.0), atol=1e-4)
+
+
+@torch.no_grad()
+def test_the_frame_turns_back_to_the_main_directions_of_the_base():
+    shape, start = (
+        template(),
+        Placement.at(random_rotations(3, generator(1)), torch.zeros(3, 3), torch.zeros(3, 1)),
+    )
+    before, _ = shape.place(start)
+    lean = roma.rotvec_to_rotmat(torch.tensor([0.15, -0.1, 0.2]))
+    for vectors in (shape.points, shape.normals, shape.axis, shape.pivot):
+        vectors.copy_(vectors @ lean.T)
+    leant = replace(start, rotation=start.rotation @ lean.T)
+    found = along_main_directions(shape, leant)
+    assert_close(found.rotation, start.rotation, atol=2e-3, rtol=0)
+    assert_close(shape.directions()[0], AXIS, atol=2e-3, rtol=0)
+    assert_close(shape.place(found)[0], before, atol=1e-4, rtol=0)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_assets.library import SPLITS, find, hash_split, instance_id, select
+from sim_assets.library import SPLITS, find, hash_split, instance_id, select, source_root
 from sim_assets.validate import AssetError
 
 FIRST = ["test", "train", "train", "test"]
@@ -110,3 +110,13 @@ def test_own_splits_are_kept(tmp_path: Path):
         select(paths, "val", tmp_path)
     alone = touch(tmp_path / "train", "c/mobility.urdf")
     assert select(alone, "test", tmp_path / "train") == alone
+
+
+def test_a_packages_folder_of_urdfs_belongs_to_the_package(tmp_path: Path):
+    package, other = touch(tmp_path, "cabinet/urdf/cabinet.urdf", "set/urdf/one/mobility.urdf")
+    inner = package.parent
+    assert source_root(inner) == source_root(package) == inner.parent.resolve()
+    assert source_root(inner.parent) == inner.parent
+    # Models in folders of their own: nothing above the source is theirs.
+    assert source_root(other.parents[1]) == other.parents[1]
+    assert instance_id(package, source_root(inner)) == instance_id(package, inner.parent)

@@ -9,7 +9,7 @@ from strategies import generator
 from torch.testing import assert_close
 
 from scapo.geometry import apply, invert, joint_motion, random_rotations
-from scapo.placed import base_centre, canonical_points, nearest_weights, placed_prediction, slides
+from scapo.placed import canonical_points, nearest_weights, placed_prediction, slides
 from scapo.points import normalise
 from scapo.template import ArticulatedTemplate, Placement
 
@@ -31,9 +31,9 @@ def test_parts_and_joint_of_a_prediction_belong_together():
         found.joints.pivot[:, 0], found.joints.axis[:, 0], state[:, 0], "revolute"
     )
     assert_close(lid, motion @ base, atol=1e-4, rtol=0)
-    centre = apply(base, base_centre(shape).expand(3, 1, 3) * 0)
+    centre = apply(base, shape.part_centres()[0].expand(3, 1, 3) * 0)
     expected = similarity.inverse(
-        (rotation @ base_centre(shape))[:, None] + placement.translation[:, None]
+        (rotation @ shape.part_centres()[0])[:, None] + placement.translation[:, None]
     )
     assert_close(centre, expected, atol=1e-5, rtol=1e-5)
     assert_close(invert(base) @ base, torch.eye(4).expand(3, 4, 4), atol=1e-5, rtol=0)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""A sliding part's axis: the way out of the body, not the way in which its place differs most."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from strategies import generator
+from torch import Tensor
+from torch.testing import assert_close
+
+from scapo.geometry import random_rotations
+from scapo.joint_fit import across_axis, search_states
+from scapo.sightings import Views, observe
+from scapo.sliding_gauge import choose_axes, protrusion
+from scapo.template import ArticulatedTemplate, Placement
+
+OUT, UP = torch.tensor([-1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
+BODY, DRAWER = torch.tensor([0.2, 0.15, 0.25]), torch.tensor([0.19, 0.12, 0.05])
+
+
+def box(half: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Points on the surface of a box about the origin, and normals."""
+    g = generator(seed)
+    face = torch.randint(3, (count,), generator=g)
+    side = torch.randint(0, 2, (count,), generator=g) * 2.0 - 1
+    points = (2 * torch.rand(count, 3, generator=g) - 1) * half
+    rows = torch.arange(count)
+    points[rows, face] = side * half[face]
+    normals = torch.zeros(count, 3)
+    normals[rows, face] = side
+    return points, normals
+
+
+def cabinet(axis: Tensor, seed: int = 0, count: int = 400) -> ArticulatedTemplate:
+    """A body with a drawer, their joint along `axis`."""
+    halves = [box(BODY, count // 2, seed), box(DRAWER, count // 2, seed + 1)]
+    made = ArticulatedTemplate(("prismatic",), count)
+    part = torch.arange(count) // (count // 2)
+    points, normals = (torch.cat(columns) for columns in zip(*halves, strict=True))
+    made.assign(points, normals, 20.0 * torch.nn.functional.one_hot(part, 2))
+    with torch.no_grad():
+        made.axis.copy_(axis[None])
+    return made
+
+
+def placements(count: int = 40) -> Placement:
+    """Drawers opened by up to 0.15 at heights that differ more than that, as states along UP."""
+    g = generator(3)
+    opened, height = 0.15 * torch.rand(count, generator=g), 0.4 * torch.rand(count, generator=g)
+    at = Placement.at(random_rotations(count, g), torch.zeros(count, 3), height[:, None] - 0.2)
+    return replace(at, shift=opened[:, None, None] * OUT)
+
+
+def test_the_axis_is_the_way_out_of_the_body():
+    template, start = cabinet(UP), placements()
+    before, _ = template.place(start)
+    found = choose_axes(template, start, torch.eye(3))
+    assert_close(template.directions().detach(), OUT[None])
+    assert_close(template.place(found)[0], before, atol=1e-5, rtol=0)
+    assert_close(found.state.mean(0), torch.zeros(1), atol=1e-6, rtol=0)
+    opened = (start.shift[:, 0] @ OUT)[:, None]
+    assert_close(found.state, opened - opened.mean(), atol=1e-6, rtol=0)
+    assert_close(found.shift[:, 0] @ UP, start.state[:, 0], atol=1e-6, rtol=0)
+
+
+def test_what_sticks_out_is_measured_from_the_scaled_body():
+    template, start = cabinet(OUT), placements(2)
+    start = replace(start, log_scale=torch.tensor([[0.0, 0, 0], [0.3, 0, 0]]))
+    offset = torch.tensor([[-0.1, 0, 0], [0.1, 0.0, 0.0]])
+    out = protrusion(template, start, offset, 0, torch.stack([OUT, -OUT]))
+    grown = 0.09 - 0.01 * (torch.tensor(0.3).exp() - 1)
+    assert_close(out, torch.tensor([[0.09, 0.0], [0.0, float(grown)]]), atol=2e-3, rtol=0)
+
+
+def test_revolute_joints_are_left_alone():
+    template = ArticulatedTemplate(("revolute",), 10)
+    start = Placement.at(torch.eye(3)[None], torch.zeros(1, 3), torch.ones(1, 1))
+    axis = template.axis.detach().clone()
+    found = choose_axes(template, start, torch.eye(3))
+    assert torch.equal(template.axis.detach(), axis)
+    assert torch.equal(found.state, start.state)
+
+
+@pytest.mark.parametrize("axis", [OUT, UP, torch.tensor([0.6, 0.0, 0.8])])
+def test_across_an_axis(axis: Tensor):
+    frame = torch.stack([axis, *across_axis(axis)])
+    assert_close(frame @ frame.T, torch.eye(3))
+
+
+def test_the_place_of_a_sliding_part_is_searched_too():
+    template, truth = cabinet(OUT), placements(4)
+    truth = replace(truth, state=torch.full((4, 1), 0.1), shift=truth.state[..., None] * UP)
+    views = seen(cabinet(OUT, 7, 4000), truth)
+    lost = replace(truth, shift=torch.zeros_like(truth.shift))
+    found = lost
+    for _ in range(2):  # the state was first sought at a wrong place
+        found = search_states(template, views, found, torch.linspace(-0.2, 0.2, 9)[None], 120.0)
+    assert (truth.shift.norm(dim=-1) > 0.1).any()
+    assert (found.shift - truth.shift).norm(dim=-1).max() < 0.04
+    assert (found.state - truth.state).abs().max() < 0.06
+
+
+def seen(template: ArticulatedTemplate, placement: Placement) -> Views:
+    """Views of the placed template from in front, to the side and above."""
+    away = torch.nn.functional.normalize(torch.tensor([-1.5, 0.7, 0.8]), dim=0)
+    camera = 2.0 * placement.rotation @ away
+    with torch.no_grad():
+        points, normals = template.place(placement)
+    facing = ((camera[:, None] - points) * normals).sum(-1)
+    index = facing.topk(1200, dim=1).indices[..., None].expand(-1, -1, 3)
+    return observe(points.gather(1, index), camera)
