@@ -197,11 +197,12 @@ def improve(
 ) -> Trusted:
     """Rebuild parts and fit template, joints and placements to the trusted views."""
     placement, views = trusted.placement, trusted.views
-    states = range_of(placement.state, template.kinds).wider(0.25).grid(11)
+    sliding = "prismatic" in template.kinds
+    states = range_of(placement.state, template.kinds).wider(0.0 if sliding else 0.25).grid(11)
     for number in range(rounds):
         rebuild(template, views, placement, generator=generator)
         placement = along_main_directions(template, placement)
-        search_at = (0,) if number < rounds // 2 else ()
+        search_at = (0,) if sliding or number < rounds // 2 else ()
         options = FitOptions(
             steps=25, sharpness=(150.0, 400.0), search_states=search_at, axis_weight=AXIS_WEIGHT
         )
@@ -213,10 +214,10 @@ def search_all(
     template: ArticulatedTemplate, views: Views, trusted: Trusted, config: DiscoveryConfig
 ) -> Finalists:
     """Every view over rotations and states, near the cameras that trusted views have."""
-    joints = len(template.kinds)
+    joints, sliding = len(template.kinds), "prismatic" in template.kinds
     known = range_of(trusted.placement.state, template.kinds)
     space = SearchSpace(
-        states=known.wider(0.3).grid(7 if joints == 1 else 4),
+        states=known.wider(0.1 if sliding else 0.3).grid(7 if joints == 1 else 4),
         rotations=rotation_grid(config.rotations),
         cameras=trusted.cameras(),
     )
