@@ -64,7 +64,7 @@ class RegisteredConfig:
     """SCAPO by registration and joint fit."""
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    learned: int = 1000
+    learned: int = 600
     """Training clouds whose placements the network learns, 0.25 s each on one core."""
     trusted: float = 0.85
     """Share of them that it learns from."""
