@@ -6,7 +6,7 @@ The symbols of the paper (SCAPO, CVPR 2026) and their names here:
 | paper | here | shape, frame |
 |---|---|---|
 | X | `Observation.points` | (N, 3), camera, m; normalised to mean radius 0.25 inside the method |
-| R_g, t_g | `camera_T_object` of stage 1 | our R is the transpose of the paper's row-vector R_g |
+| R_g, t_g | `Encoding.rotation`, `.translation` | R is the transpose of the row-vector R_g |
 | S_obj | aligned points | (N, 3), aligned frame: X with the global pose undone |
 | S* | canonical points | (N, 3), aligned frame at the canonical states |
 | Y_base, Delta S_X, Y_X | template, residual, their sum | (M, 3), template frame |

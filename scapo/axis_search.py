@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from scapo.geometry import project_rotation
 from scapo.part_evidence import gather_evidence, spread
 from scapo.registration import HIDDEN_COST, NORMAL_WEIGHT, NearestGrid
 from scapo.sightings import Views, free_and_hidden
@@ -79,7 +80,8 @@ def along_main_directions(template: ArticulatedTemplate, placement: Placement) -
 
     While shape, axes and all placements are fitted together nothing holds the frame: the whole
     template can turn in it. What is said of directions (axes along the main ones, scales along the
-    frame's) then means something else in every round.
+    frame's) then means something else in every round. Scales keep their numbers along the new
+    axes: with unequal ones the placed template changes a little.
 
     Returns:
         The placements of the turned template.
@@ -101,9 +103,8 @@ def _settled(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Floa
         along = projected.gather(1, axis[:, None])
         weight = torch.exp(-12 * (1 - along.abs())) * along.sign()
         rows = torch.stack([(normals * weight)[axis == c].sum(0) for c in range(3)])
-        u, _, vh = torch.linalg.svd(F.normalize(rows, dim=-1))
-        frame = u @ vh
-    return frame * torch.linalg.det(frame).sign()
+        frame = project_rotation(F.normalize(rows, dim=-1))
+    return frame
 
 
 def _amounts(kind: JointKind) -> Float[Tensor, " D"]:

@@ -2,7 +2,8 @@
 """From bare views to an articulated template, without labels and without a network.
 
 Pairwise registrations of a few views vote for one frame; what moves in it gives candidate joints;
-each start is optimised and the one with the least loss goes on; then rounds of search (every view
+several sets of such views are drawn, every start is optimised, the best of each set search other
+views, and the one that explains those best goes on; then rounds of search (every view
 over rotations and states) and joint fit on the views that are trusted, a larger share each round.
 """
 

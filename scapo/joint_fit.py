@@ -39,12 +39,15 @@ class FitOptions:
     points: int = 128
     """Of each view, drawn anew every step."""
     rate: float = 1.0
+    """Factor on all learning rates."""
     backward: float = 1.0
     """Weight of what the camera should have seen."""
     search_states: tuple[int, ...] = ()
     """Steps at which every state is searched over `states`."""
     scale_weight: float = 0.05
+    """Of the squared log scales."""
     shift_weight: float = 0.2
+    """Of a sliding part's squared place across its axis, per squared normalised length."""
     slide_weight: float = 0.7
     """Of a sliding joint's states about their mean: without it a part slides right through the body
     to explain its far side."""
@@ -245,7 +248,7 @@ def _shared_groups(template: ArticulatedTemplate, rate: float) -> list[dict[str,
 
 
 def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOptions) -> Tensor:
-    """What the views leave open: mean scale and state near zero, no part without points.
+    """What the views leave open: all that is not a pose near zero, no part without points.
 
     Instances whose axes lean to either side of the category's are explained a little better by an
     axis that leans far to a third side; axes of made things mostly follow their main directions.

@@ -40,10 +40,13 @@ class StepOptions:
     """Asked whether the camera would have seen them."""
     backward: float = 1.0
     scale_weight: float = 0.05
+    """Of the squared log scales."""
     shift_weight: float = 0.2
+    """Of a sliding part's squared place across its axis, per squared normalised length."""
     slide_weight: float = 0.7
-    """Of a sliding joint's state, as in `joint_fit.FitOptions`."""
+    """Of a sliding joint's squared state: about 0, where `joint_fit` has the views' mean."""
     damping: float = 0.02
+    """Share of the system's diagonal that is added to it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

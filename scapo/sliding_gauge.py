@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -58,7 +57,7 @@ def choose_axes(
 ) -> Placement:
     """Turn each sliding joint's axis to where its part comes out most, states and shifts with it.
 
-    The placed template stays what it was but for the mean state, which becomes 0.
+    The placed template stays what it was; the mean state becomes 0 but for what scales make of it.
 
     Args:
         template: Axes and points of parts change.
@@ -76,12 +75,14 @@ def choose_axes(
         offset = shift[:, j] + state[:, j, None] * template.directions()[j]
         out = protrusion(template, placement, offset, j, both)
         spread = out.quantile(0.9, dim=0) - out.quantile(0.1, dim=0)
+        if not spread.max() > 0:  # it comes out nowhere: the axis stays
+            continue
         axis = both[spread.argmax()]
-        along = offset @ axis
-        middle = along.mean()
+        middle = (offset @ axis).mean()
         weight = template.logit.softmax(-1)[:, j + 1, None]
         template.points.add_(weight * middle * axis)
-        template.axis[j] = F.normalize(axis, dim=0)
-        state[:, j] = along - middle
-        shift[:, j] = offset - along[:, None] * axis
+        template.axis[j] = axis
+        rest = offset - middle * axis * placement.log_scale.exp()
+        state[:, j] = rest @ axis
+        shift[:, j] = rest - state[:, j, None] * axis
     return replace(placement, state=state, shift=shift)

@@ -95,6 +95,8 @@ def instance_id(urdf: Path, root: Path) -> str:
     folder = urdf.resolve().parent
     relative = folder.relative_to(root.resolve())
     pieces = list(relative.parts) or [folder.name]
+    if len(pieces) == 1 and folder.name in INNER:  # says nothing: the package's name
+        pieces = [folder.parent.name]
     if len(_models(folder, _siblings(folder))) > 1:
         pieces.append(urdf.stem)
     word = "-".join(pieces)
@@ -106,7 +108,8 @@ def instance_id(urdf: Path, root: Path) -> str:
 
 
 def _siblings(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() == ".urdf")
+    names = (p.name for p in folder.iterdir() if p.suffix.lower() == ".urdf")
+    return sorted(name for name in names if name[0] != ".")
 
 
 def select(paths: Sequence[Path], split: str, root: Path) -> list[Path]:
@@ -136,7 +139,7 @@ def select(paths: Sequence[Path], split: str, root: Path) -> list[Path]:
 
 
 def _own_split(path: Path, root: Path) -> str | None:
-    parts = path.resolve().relative_to(root.resolve()).parts[:-1] if path != root else ()
+    parts = path.resolve().relative_to(root.resolve()).parts[:-1]
     return next((part for part in parts if part in SPLITS), None)
 
 

@@ -119,4 +119,4 @@ def test_a_packages_folder_of_urdfs_belongs_to_the_package(tmp_path: Path):
     assert source_root(inner.parent) == inner.parent
     # Models in folders of their own: nothing above the source is theirs.
     assert source_root(other.parents[1]) == other.parents[1]
-    assert instance_id(package, source_root(inner)) == instance_id(package, inner.parent)
+    assert instance_id(package, source_root(inner)) == "cabinet"

@@ -47,7 +47,9 @@ def test_parts_move_as_their_joint_says(kind: JointKind):
     assert_close(points[:, 1::2], apply(view_T_base @ motion, scaled[:, 1::2]))
     assert_close(normals.norm(dim=-1), torch.ones(4, 20))
     seen, direction = template.joints_in_view(placement)
-    assert_close(seen, apply(view_T_base, (pivot + placement.shift[:, 0])[:, None]))
+    middle = template.part_centres()[1:] if kind == "prismatic" else template.pivot
+    spot = middle * placement.log_scale.exp() + placement.shift[:, 0]
+    assert_close(seen, apply(view_T_base, spot[:, None]))
     assert_close(direction[:, 0], (placement.rotation @ axis[..., None])[..., 0])
 
 

@@ -3,17 +3,12 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
+import made
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import made
 
 from bench.evaluate import Request, evaluate
 from bench.predictions import write_predictions

@@ -131,9 +131,10 @@ def limits(step: Callable[[], None], count: int = 8) -> tuple[tuple[str, float],
 
 def apart(stage: str, processes: int, rounds: int) -> Speed:
     """`measure` in fresh processes side by side, whose memory is that of this stage alone."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[name] = "1"
-    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+    spawn = multiprocessing.get_context("spawn")
+    with pytest.MonkeyPatch.context() as patch, ProcessPoolExecutor(processes, spawn) as pool:
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            patch.setenv(name, "1")
         found = list(pool.map(measure, [stage] * processes, [rounds] * processes))
     return replace(
         found[0],
@@ -171,4 +172,4 @@ def test_training_of_the_cpu_preset(
     benchmark.extra_info["speed"] = lines
     benchmark.pedantic(training_step(config, CANONICALISE, config.batch), rounds=3)
     # Per sample, all of stage 1 (three encodings) against one encoding, decoder and Chamfer.
-    assert found[CANONICALISE].per_cpu_second > TARGET * literal.per_cpu_second
+    assert min(s.per_cpu_second for s in found.values()) > TARGET * literal.per_cpu_second
