@@ -228,12 +228,17 @@ def search_all(
 def winner(
     tried: list[tuple[ArticulatedTemplate, Trusted]], views: Views, config: DiscoveryConfig
 ) -> tuple[ArticulatedTemplate, Trusted]:
-    """The start that explains best other views than those it was made from."""
+    """The start that explains best other views than those it was made from.
+
+    Its range of states counts too: a joint along a wrong axis explains almost as much, but needs
+    more of it.
+    """
     some = views.take(evenly(len(views.points), config.judged))
     losses = []
     for template, trusted in tried:
-        found = search_all(template, some, trusted, config)
-        losses.append(float(found.best().loss.mean()))
+        finalists = search_all(template, some, trusted, config)
+        states = narrowest(finalists.placement, finalists.loss, template.kinds)
+        losses.append(float(finalists.best(states).loss.mean()) + states.cost())
     return tried[min(range(len(losses)), key=losses.__getitem__)]
 
 

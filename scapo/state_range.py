@@ -41,6 +41,10 @@ class StateRange:
         outside = (self.low - state).clamp_min(0) + (state - self.high).clamp_min(0)
         return (SLOPE * outside * self.unit).clamp_max(OUTSIDE_COST).sum(-1)
 
+    def cost(self) -> float:
+        """What the range itself costs."""
+        return RANGE_COST * float(((self.high - self.low) * self.unit).sum())
+
     def wider(self, share: float) -> StateRange:
         """With room of a share of the range on both sides."""
         room = share * (self.high - self.low)
