@@ -24,7 +24,7 @@ from sim_assets.stream import _samples
 SHARE = 0.8
 """Of the bare loops' rate that the command must reach."""
 ALONE = 0.65
-"""The same by processor time of one process, measured to notice a fall: less steady, 0.69 to 0.99."""
+"""The same in one process by processor time, to notice a fall: less steady, 0.69 to 0.99."""
 MEMORY_MB = 40
 """By which the process may grow over the later objects."""
 
