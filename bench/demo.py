@@ -221,7 +221,7 @@ def closing_words(demo: Demo, seconds: float) -> str:
     return f"""
 Done in {seconds / 60:.1f} minutes: {demo.train} training and {demo.test} test clouds of each
 category rendered; SCAPO trained on the training clouds without labels, {demo.epochs} epochs a
-stage, far less than the benchmark's; ICP registered against five labelled training shapes; all
+stage, on far fewer than the benchmark's; ICP registered against five labelled training shapes; all
 scored on the test clouds. On partial views the paper's method needs more than this:
 --methods registered is the variant made for them (results/EXPERIMENTS.md).
 
