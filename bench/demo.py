@@ -220,8 +220,8 @@ def closing_words(demo: Demo, seconds: float) -> str:
     """What was done, where it lies, and what to do next."""
     return f"""
 Done in {seconds / 60:.1f} minutes: {demo.train} training and {demo.test} test clouds of each
-category rendered; SCAPO trained on the training clouds without labels, {demo.epochs} epochs a
-stage, on far fewer than the benchmark's; ICP registered against five labelled training shapes; all
+category rendered; SCAPO trained on the training clouds, far fewer than the benchmark's, without
+labels, {demo.epochs} epochs a stage; ICP registered against five labelled training shapes; all
 scored on the test clouds. On partial views the paper's method needs more than this:
 --methods registered is the variant made for them (results/EXPERIMENTS.md).
 

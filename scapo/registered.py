@@ -269,12 +269,10 @@ class RegisteredScapo(AbstractMethod):
         """
         turned = (frame @ camera[..., None])[..., 0]
         views = observe(points @ frame.mT, turned, count=self.config.points)
-        start = [turn_placement(proposed, frame.repeat_interleave(4, 0))]
+        start, space = [turn_placement(proposed, frame.repeat_interleave(4, 0))], self._space()
         if self.config.grid_hypotheses:
-            start.append(propose(self.template, views, self._space()))
-        finalists = tournament(
-            self.template, views, interleave(start, len(points)), self._space().states
-        )
+            start.append(propose(self.template, views, space))
+        finalists = tournament(self.template, views, interleave(start, len(points)), space.states)
         found = finalists.best(self._states().wider(0.1))
         final = settle_states(self.template, views, found, self._states())
         return turn_placement(final, frame.mT), found.margin

@@ -15,10 +15,8 @@ AXIS = torch.tensor([0.0, 1.0, 0.0])
 PIVOT = torch.tensor([-0.2, 0.0, -0.15])
 
 
-def surface(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Points, outward normals and parts of an oblong box (0) with a flap (1) at state 0."""
-    g = generator(seed)
-    half = torch.tensor([0.2, 0.28, 0.15])
+def box(half: Tensor, count: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Points on the surface of a box about the origin, its half sides given, and normals."""
     face = torch.randint(3, (count,), generator=g)
     side = torch.randint(0, 2, (count,), generator=g) * 2.0 - 1
     points = (2 * torch.rand(count, 3, generator=g) - 1) * half
@@ -26,6 +24,13 @@ def surface(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     points[rows, face] = side * half[face]
     normals = torch.zeros(count, 3)
     normals[rows, face] = side
+    return points, normals
+
+
+def surface(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Points, outward normals and parts of an oblong box (0) with a flap (1) at state 0."""
+    g = generator(seed)
+    points, normals = box(torch.tensor([0.2, 0.28, 0.15]), count, g)
     flap = torch.rand(count, generator=g) < 0.4
     u, v = torch.rand(2, count, generator=g)
     lid = torch.stack([-0.2 - 0.3 * u, 0.5 * v - 0.25, torch.full((count,), -0.15)], -1)

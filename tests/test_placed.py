@@ -9,9 +9,9 @@ from strategies import generator
 from torch.testing import assert_close
 
 from scapo.geometry import apply, invert, joint_motion, random_rotations
-from scapo.placed import canonical_points, nearest_weights, placed_prediction, slides
+from scapo.placed import canonical_points, nearest_weights, placed_prediction
 from scapo.points import normalise
-from scapo.template import ArticulatedTemplate, Placement
+from scapo.template import ArticulatedTemplate, Placement, slides
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sighted import box
 from strategies import generator
 from torch import Tensor
 from torch.testing import assert_close
@@ -21,22 +22,9 @@ OUT, UP = torch.tensor([-1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
 BODY, DRAWER = torch.tensor([0.2, 0.15, 0.25]), torch.tensor([0.19, 0.12, 0.05])
 
 
-def box(half: Tensor, count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Points on the surface of a box about the origin, and normals."""
-    g = generator(seed)
-    face = torch.randint(3, (count,), generator=g)
-    side = torch.randint(0, 2, (count,), generator=g) * 2.0 - 1
-    points = (2 * torch.rand(count, 3, generator=g) - 1) * half
-    rows = torch.arange(count)
-    points[rows, face] = side * half[face]
-    normals = torch.zeros(count, 3)
-    normals[rows, face] = side
-    return points, normals
-
-
 def cabinet(axis: Tensor, seed: int = 0, count: int = 400) -> ArticulatedTemplate:
     """A body with a drawer, their joint along `axis`."""
-    halves = [box(BODY, count // 2, seed), box(DRAWER, count // 2, seed + 1)]
+    halves = [box(half, count // 2, generator(seed)) for half in (BODY, DRAWER)]
     made = ArticulatedTemplate(("prismatic",), count)
     part = torch.arange(count) // (count // 2)
     points, normals = (torch.cat(columns) for columns in zip(*halves, strict=True))
@@ -64,6 +52,24 @@ def test_the_axis_is_the_way_out_of_the_body():
     opened = (start.shift[:, 0] @ OUT)[:, None]
     assert_close(found.state, opened - opened.mean(), atol=1e-6, rtol=0)
     assert_close(found.shift[:, 0] @ UP, start.state[:, 0], atol=1e-6, rtol=0)
+
+
+def test_the_placed_template_stays_under_any_scales():
+    template, start = cabinet(UP), placements()
+    start = replace(start, log_scale=0.2 * torch.randn(40, 3, generator=generator(4)))
+    before, _ = template.place(start)
+    found = choose_axes(template, start, torch.eye(3))
+    assert_close(template.directions().detach(), OUT[None])
+    assert_close(template.place(found)[0], before, atol=1e-5, rtol=0)
+
+
+def test_a_part_that_comes_out_nowhere_keeps_its_axis():
+    template = cabinet(UP)
+    start = Placement.at(torch.eye(3).expand(4, 3, 3), torch.zeros(4, 3), torch.zeros(4, 1))
+    found = choose_axes(template, start, torch.eye(3))
+    assert_close(template.directions().detach(), UP[None])
+    assert torch.equal(found.state, start.state)
+    assert torch.equal(found.shift, start.shift)
 
 
 def test_what_sticks_out_is_measured_from_the_scaled_body():
