@@ -8,12 +8,14 @@ job with one line, 2 on wrong usage, 130 when interrupted.
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Sequence
 from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.markup import escape
 
 from bench.predict import Predict
@@ -43,8 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             tyro.conf.FlagCreatePairsOff,
         ),
     )
+    console = Console()
+    logging.basicConfig(
+        format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
+    )
     try:
-        command.run(Console())
+        command.run(console)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         complain(" ".join(str(error).split()))
         sys.exit(1)

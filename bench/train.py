@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,6 +96,7 @@ class Train(Generic[M]):
             f"device {config.device}"
         )
         data = read_training_data(split)
+        logging.getLogger("scapo").setLevel(logging.WARNING if console.quiet else logging.INFO)
         with _bars(console) as progress:
             fit.fit(method, data, self.out, config, resume=self.resume, listener=_Bar(progress))
 

@@ -1,191 +1,32 @@
 # SPDX-License-Identifier: MIT
 """From bare views to an articulated template, without labels and without a network.
 
-Pairwise registrations of a few views vote for one frame; what moves in it gives candidate joints;
-several sets of such views are drawn, every start is optimised, the best of each set search other
-views, and the one that explains those best goes on; then rounds of search (every view
-over rotations and states) and joint fit on the views that are trusted, a larger share each round.
+Several sets of views give starts (`starts`). Then come rounds of search (every view over rotations
+and states) and joint fit on the views that are trusted, a larger share each round. Views that are
+held out judge which starts enter the rounds, and which one goes on to the end.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import product
+import logging
 
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
-from scapo.axis_search import (
-    JointGuess,
-    Posed,
-    along_main_directions,
-    principal_frame,
-    search_joint,
-    still_evidence,
-)
-from scapo.consensus import agree
+from scapo.axis_search import along_main_directions
 from scapo.joint_fit import FitOptions, fit
 from scapo.method import evenly
-from scapo.part_evidence import farthest_features, rebuild
+from scapo.part_evidence import rebuild
 from scapo.pose_search import Finalists, Found, SearchSpace, search
-from scapo.registration import register_pairs, rotation_grid
+from scapo.registration import rotation_grid
 from scapo.sightings import Views
-from scapo.sliding_gauge import choose_axes
+from scapo.starts import AXIS_WEIGHT, DiscoveryConfig, Start, Trusted, common_frame, starts
 from scapo.state_range import narrowest, range_of
-from scapo.template import ArticulatedTemplate, Placement
+from scapo.template import ArticulatedTemplate
 from scapo.types import JointKind
 
-AXIS_WEIGHT = 1.0
-"""Of `FitOptions.axis_weight` once a start is chosen: before, wrong axes must be free to turn."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DiscoveryConfig:
-    """How much is tried; times are seconds on one CPU core per view or pair."""
-
-    seeds: int = 72
-    """Views registered with one another, 10 ms a pair."""
-    agreeing: float = 0.4
-    """Share of them, the most confident, that the first fit uses."""
-    rotations: int = 1000
-    """Of the grid that registration and search try."""
-    searched: int = 144
-    """Views of the rounds of search and fit, 0.2 s each and round."""
-    trusted: tuple[float, ...] = (0.4, 0.55, 0.7, 0.85)
-    """Share of the searched views that each round keeps."""
-    starts: int = 3
-    """Candidate axes of each joint that are optimised; two of each where joints are several."""
-    draws: int = 3
-    """Sets of seeds: how many of their poses agree is a matter of luck."""
-    contenders: int = 2
-    """Starts of each set, those of least loss, that search `judged` views; the one that explains
-    them best goes on."""
-    judged: int = 48
-    template_points: int = 400
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trusted:
-    """Views and their placements on a template."""
-
-    views: Views
-    placement: Placement
-
-    def cameras(self) -> Float[Tensor, "B 3"]:
-        """Directions to the cameras in the template frame."""
-        direction = self.views.direction()[:, :, None]
-        return (self.placement.rotation.mT @ direction)[..., 0]
-
-
-def common_frame(views: Views, config: DiscoveryConfig) -> Posed:
-    """The views that agree best, in one frame along the object's main directions."""
-    count = len(views.points)
-    pairs = torch.combinations(torch.arange(count)).flip(-1)
-    rotations = rotation_grid(config.rotations)
-    modes = register_pairs(views, pairs, rotations=rotations)
-    consensus = agree(count, pairs, modes)
-    kept = consensus.confidence.topk(max(2, round(config.agreeing * count))).indices
-    views = views.take(kept)
-    rotation, translation = consensus.rotation[kept], consensus.translation[kept]
-    normals = views.normals[:, ::4] @ rotation.mT
-    frame = principal_frame(normals.flatten(0, 1), rotation_grid(1500))
-    rotation, translation = frame @ rotation, translation @ frame.T
-    points = views.points @ rotation.mT + translation[:, None]
-    translation = translation - points.flatten(0, 1).median(0).values
-    back = rotation.mT
-    return Posed(views=views, rotation=back, translation=-(back @ translation[..., None])[..., 0])
-
-
-def moved_sets(posed: Posed, joints: int, generator: torch.Generator) -> list[Bool[Tensor, "B K"]]:
-    """For each joint, the points of every view that other views do not confirm where they are.
-
-    Several joints share them by distance to as many centres (k-means in the common frame).
-    """
-    evidence = still_evidence(posed)
-    moved = evidence < evidence.flatten().quantile(0.3)
-    if joints == 1:
-        return [moved]
-    points, _ = posed.world(moved.shape[1])
-    cloud = points[moved]
-    centres = cloud[torch.randperm(len(cloud), generator=generator)[:joints]]
-    for _ in range(20):
-        nearest = torch.cdist(cloud, centres).argmin(-1)
-        means = [cloud[nearest == k].mean(0) for k in range(joints)]
-        centres = torch.where(torch.stack(means).isnan(), centres, torch.stack(means))
-    label = torch.cdist(points.flatten(0, 1), centres).argmin(-1).view(moved.shape)
-    return [moved & (label == k) for k in range(joints)]
-
-
-def wide_states(kinds: tuple[JointKind, ...], count: int = 13) -> Float[Tensor, "J {count}"]:
-    """All that a joint could do, before anything is known."""
-    ends = [1.7 if kind == "revolute" else 0.25 for kind in kinds]
-    return torch.stack([torch.linspace(-end, end, count) for end in ends])
-
-
-def first_template(
-    posed: Posed,
-    moved: list[Bool[Tensor, "B K"]],
-    guesses: tuple[JointGuess, ...],
-    kinds: tuple[JointKind, ...],
-    count: int,
-) -> ArticulatedTemplate:
-    """Still points as base and moved points as parts, the guessed joints between them."""
-    points, normals = (x.flatten(0, 1) for x in posed.world(moved[0].shape[1]))
-    label = torch.zeros_like(moved[0], dtype=torch.long)
-    for j, rows in enumerate(moved):
-        label[rows] = j + 1
-    part = F.one_hot(label.flatten(), len(kinds) + 1).to(points)
-    index = farthest_features(torch.cat([points, 0.06 * normals, 0.1 * part], -1)[::2], count) * 2
-    template = ArticulatedTemplate(kinds, count)
-    template.assign(points[index], normals[index], 3 * part[index])
-    with torch.no_grad():
-        template.axis.copy_(torch.stack([guess.axis for guess in guesses]))
-        template.pivot.copy_(torch.stack([guess.pivot for guess in guesses]))
-    return template
-
-
-def starts(
-    posed: Posed, kinds: tuple[JointKind, ...], config: DiscoveryConfig, generator: torch.Generator
-) -> list[tuple[ArticulatedTemplate, Trusted]]:
-    """A template for every combination of candidate axes, those with the least loss first."""
-    moved = moved_sets(posed, len(kinds), generator)
-    guesses = [
-        search_joint(posed, rows, kind, torch.eye(3), generator=generator)
-        for rows, kind in zip(moved, kinds, strict=True)
-    ]
-    none = torch.zeros(len(posed.rotation), len(kinds))
-    tried: list[tuple[float, ArticulatedTemplate, Placement]] = []
-    each = config.starts if len(kinds) == 1 else min(config.starts, 2)
-    for combination in product(*[found[:each] for found in guesses]):
-        template = first_template(posed, moved, combination, kinds, config.template_points)
-        placement = Placement.at(posed.rotation, posed.translation, none)
-        placement, loss = _first_rounds(template, posed.views, placement, generator)
-        tried.append((float(loss.mean()), template, placement))
-    tried.sort(key=lambda start: start[0])
-    return [(t, Trusted(views=posed.views, placement=placement)) for _, t, placement in tried]
-
-
-def _first_rounds(
-    template: ArticulatedTemplate, views: Views, placement: Placement, generator: torch.Generator
-) -> tuple[Placement, Float[Tensor, " B"]]:
-    """Fit and rebuild a start; a sliding joint gets its axis after the first fit and keeps it."""
-    kinds, axis_weight = template.kinds, 0.0
-    states = wide_states(kinds)
-    for number in range(4):
-        options = FitOptions(
-            steps=30,
-            sharpness=(60.0, 200.0) if number == 0 else (120.0, 300.0),
-            search_states=(0, 15),
-            axis_weight=axis_weight,
-        )
-        placement, _ = fit(template, views, placement, options, states=states, generator=generator)
-        if number == 0 and "prismatic" in kinds:
-            placement, axis_weight = choose_axes(template, placement, torch.eye(3)), AXIS_WEIGHT
-        rebuild(template, views, placement, generator=generator)
-    options = FitOptions(steps=20, axis_weight=axis_weight)
-    return fit(template, views, placement, options, generator=generator)
+logger = logging.getLogger(__name__)
 
 
 def trust_order(found: Found) -> Int[Tensor, " B"]:
@@ -225,38 +66,74 @@ def search_all(
     return search(template, views, space)
 
 
-def winner(
-    tried: list[tuple[ArticulatedTemplate, Trusted]], views: Views, config: DiscoveryConfig
-) -> tuple[ArticulatedTemplate, Trusted]:
-    """The start that explains best other views than those it was made from.
+def unexplained(
+    template: ArticulatedTemplate, trusted: Trusted, views: Views, config: DiscoveryConfig
+) -> float:
+    """Mean loss of views within their narrowest range of states, plus what that range costs.
 
-    Its range of states counts too: a joint along a wrong axis explains almost as much, but needs
-    more of it.
+    The range counts because a joint along a wrong axis explains almost as much with more of it.
     """
-    some = views.take(evenly(len(views.points), config.judged))
-    losses = []
-    for template, trusted in tried:
-        finalists = search_all(template, some, trusted, config)
-        states = narrowest(finalists.placement, finalists.loss, template.kinds)
-        losses.append(float(finalists.best(states).loss.mean()) + states.cost())
-    return tried[min(range(len(losses)), key=losses.__getitem__)]
+    finalists = search_all(template, views, trusted, config)
+    states = narrowest(finalists.placement, finalists.loss, template.kinds)
+    return float(finalists.best(states).loss.mean()) + states.cost()
+
+
+def leaders(tried: list[Start], held: Views, count: int, config: DiscoveryConfig) -> list[Start]:
+    """Those of the starts that explain the held-out views best, the best first."""
+    if len(tried) == 1:
+        return tried
+    losses = [unexplained(*start, held, config) for start in tried]
+    order = sorted(range(len(tried)), key=losses.__getitem__)[:count]
+    logger.info("starts judged: %s; kept: %s", " ".join(f"{x:.3f}" for x in losses), order)
+    return [tried[k] for k in order]
+
+
+def held_out(views: Views, count: int) -> tuple[Views, Views]:
+    """Evenly spread views that judge, at most a quarter, and the others."""
+    total = len(views.points)
+    judges = evenly(total, min(count, total // 4))
+    rest = torch.ones(total, dtype=torch.bool).index_fill(0, judges, False)
+    return views.take(judges), views.take(rest.nonzero()[:, 0])
+
+
+def advance(
+    start: Start,
+    searched: Views,
+    share: float,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> Start:
+    """One round: search all views, and fit the template to the share that is trusted most."""
+    template, trusted = start
+    finalists = search_all(template, searched, trusted, config)
+    found = finalists.best(narrowest(finalists.placement, finalists.loss, template.kinds))
+    kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
+    trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
+    return template, improve(template, trusted, generator)
 
 
 def discover(
     views: Views, kinds: tuple[JointKind, ...], config: DiscoveryConfig, generator: torch.Generator
-) -> tuple[ArticulatedTemplate, Trusted]:
+) -> Start:
     """The articulated template of views of one category, with the views it was fitted to."""
-    tried = []
+    judges, others = held_out(views, config.judged)
+    total, tried = len(others.points), list[Start]()
     for draw in range(config.draws):
-        seeds = (evenly(len(views.points), config.seeds) + 3 * draw) % len(views.points)
-        posed = common_frame(views.take(seeds), config)
+        seeds = (evenly(total, config.seeds) + 3 * draw) % total
+        posed = common_frame(others.take(seeds), config)
         tried += starts(posed, kinds, config, generator)[: config.contenders]
-    template, trusted = winner(tried, views, config)
-    searched = views.take(evenly(len(views.points), config.searched))
+        logger.info("set of seeds %d of %d: %d starts", draw + 1, config.draws, len(tried))
+    tried = leaders(tried, judges, config.finalists, config)
+    half = others.take(evenly(total, config.searched // 2))
+    for share in config.heats:
+        tried = [advance(start, half, share, config, generator) for start in tried]
+    best = leaders(tried, judges, 1, config)[0]
+    searched = others.take(evenly(total, config.searched))
     for share in config.trusted:
-        finalists = search_all(template, searched, trusted, config)
-        found = finalists.best(narrowest(finalists.placement, finalists.loss, kinds))
-        kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
-        trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
-        trusted = improve(template, trusted, generator)
-    return template, trusted
+        best = advance(best, searched, share, config, generator)
+        logger.info(
+            "round on the most trusted %d of %d views",
+            len(best[1].views.points),
+            len(searched.points),
+        )
+    return best

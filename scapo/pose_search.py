@@ -127,13 +127,18 @@ def refine(
     start: Placement,
     options: StepOptions | None = None,
 ) -> tuple[Placement, Float[Tensor, " H"]]:
-    """Improve hypotheses (as many as views) and give the loss of each."""
+    """Improve hypotheses (as many as views) and give the loss of each.
+
+    The loss is over every second point, or all if the steps use them all.
+    """
     options = options or StepOptions()
     placements, losses = [], []
     for index in torch.arange(len(views.points), device=views.points.device).split(CHUNK):
         part = views.take(index)
         placement = settle(template, part, start.take(index), options)
-        some = thin(part, torch.arange(0, part.points.shape[1], 2, device=index.device))
+        total = part.points.shape[1]
+        every = 1 if options.points >= total else 2
+        some = thin(part, torch.arange(0, total, every, device=index.device))
         loss = view_loss(some, template.place(placement), 250.0, 2.0)
         placements.append(placement)
         losses.append(loss + 0.05 * placement.log_scale.square().sum(-1))
@@ -206,9 +211,10 @@ def _states_again(
 ROUNDS = (
     (StepOptions(steps=3, points=48, template_points=64), 16),
     (StepOptions(steps=5, points=96), 6),
-    (StepOptions(steps=10, points=128), 0),
 )
 """Of `tournament`: steps, and how many distinct hypotheses of a view go on."""
+LAST = (StepOptions(steps=10, points=128), StepOptions(steps=4, points=256))
+"""Steps of those that are left, with all points at the end: what ranks them should be sharp."""
 
 
 def tournament(
@@ -222,16 +228,17 @@ def tournament(
     """
     count = len(views.points)
     first = torch.arange(count, device=views.points.device)
-    placement, loss = start, views.points.new_zeros(len(start.state))
+    placement = start
     for options, left in ROUNDS:
         number = len(placement.state) // count
         index = first.repeat_interleave(number)
-        if not left:
-            placement = _states_again(template, views.take(index), placement, states)
         placement, loss = refine(template, views.take(index), placement, options)
-        if left:
-            table = placement.rotation.unflatten(0, (count, number))
-            best = distinct(table, loss.view(count, number), min(left, number), 12.0)
-            chosen = (best + first[:, None] * number).flatten()
-            placement, loss = placement.take(chosen), loss[chosen]
+        table = placement.rotation.unflatten(0, (count, number))
+        best = distinct(table, loss.view(count, number), min(left, number), 12.0)
+        placement = placement.take((best + first[:, None] * number).flatten())
+    repeated = views.take(first.repeat_interleave(len(placement.state) // count))
+    placement = _states_again(template, repeated, placement, states)
+    loss = views.points.new_zeros(len(placement.state))
+    for options in LAST:
+        placement, loss = refine(template, repeated, placement, options)
     return Finalists(placement=placement, loss=loss.view(count, -1))

@@ -24,14 +24,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from scapo.discovery import (
-    DiscoveryConfig,
-    discover,
-    evenly,
-    search_all,
-    trust_order,
-)
-from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
+from scapo.discovery import discover, search_all, trust_order
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
 from scapo.pictures import PictureData
 from scapo.placed import nearest_weights, placed_prediction
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
@@ -47,6 +41,7 @@ from scapo.pseudo_placements import PseudoPlacements
 from scapo.registered_pictures import template_pictures
 from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
+from scapo.starts import DiscoveryConfig
 from scapo.state_range import StateRange, range_of
 from scapo.stray_points import belongs, replaced, without_strays
 from scapo.template import (

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: MIT
+"""What is tried before anything is known, and what a view's moved points are."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from sighted import sighted
+from strategies import generator
+
+from scapo.axis_search import Posed
+from scapo.starts import moved_sets, wide_states
+
+
+def test_ranges_before_anything_is_known():
+    assert wide_states(("revolute", "prismatic"), 5)[:, -1].tolist() == pytest.approx([1.7, 0.25])
+
+
+def test_points_that_no_other_view_confirms_are_shared_among_the_joints():
+    views, truth = sighted(12, seed=3)
+    posed = Posed(views=views, rotation=truth.rotation, translation=truth.translation)
+    alone = moved_sets(posed, 1, generator(0))[0]
+    assert 0.2 < alone.float().mean() < 0.4
+    points, _ = posed.world(alone.shape[1])
+    flap = (points[..., 0] < -0.22) | (points[..., 2].abs() > 0.17)
+    assert flap[alone].float().mean() > 1.5 * flap.float().mean()
+    several = moved_sets(posed, 2, generator(0))
+    assert not (several[0] & several[1]).any()
+    assert torch.equal(several[0] | several[1], alone)
