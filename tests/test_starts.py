@@ -3,13 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from sighted import sighted
+from sliding import OUT, UP, cabinet, placements, seen
 from strategies import generator
 
 from scapo.axis_search import Posed
-from scapo.starts import moved_sets, wide_states
+from scapo.geometry import axis_angle
+from scapo.starts import DiscoveryConfig, moved_sets, starts, wide_states
 
 
 def test_ranges_before_anything_is_known():
@@ -27,3 +31,19 @@ def test_points_that_no_other_view_confirms_are_shared_among_the_joints():
     several = moved_sets(posed, 2, generator(0))
     assert not (several[0] & several[1]).any()
     assert torch.equal(several[0] | several[1], alone)
+
+
+@pytest.mark.slow
+def test_a_drawer_at_different_heights_slides_out_not_up():
+    truth = placements(24)
+    truth = replace(
+        truth, shift=truth.shift + 0.6 * truth.state[..., None] * UP, state=0 * truth.state
+    )
+    views = seen(cabinet(OUT, 7, 4000), truth)
+    posed = Posed(views=views, rotation=truth.rotation, translation=truth.translation)
+    tried = starts(posed, ("prismatic",), DiscoveryConfig(starts=2), generator(0))
+    assert len(tried) == 2
+    for template, trusted in tried:
+        assert axis_angle(template.directions()[0].detach(), OUT).rad2deg() < 10
+        opened = torch.stack([trusted.placement.state[:, 0], truth.shift[:, 0] @ OUT])
+        assert torch.corrcoef(opened)[0, 1].abs() > 0.9
