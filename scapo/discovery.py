@@ -21,6 +21,7 @@ from scapo.part_evidence import rebuild
 from scapo.pose_search import Finalists, Found, SearchSpace, search
 from scapo.registration import rotation_grid
 from scapo.sightings import Views
+from scapo.sliding_gauge import choose_axes
 from scapo.starts import AXIS_WEIGHT, DiscoveryConfig, Start, Trusted, common_frame, starts
 from scapo.state_range import narrowest, range_of
 from scapo.template import ArticulatedTemplate
@@ -44,6 +45,8 @@ def improve(
     for number in range(rounds):
         rebuild(template, views, placement, generator=generator)
         placement = along_main_directions(template, placement)
+        if number == 0:  # a start whose parts were poor may have taken a wrong way out
+            placement = choose_axes(template, placement, torch.eye(3))
         search_at = (0,) if sliding or number < rounds // 2 else ()
         options = FitOptions(
             steps=25, sharpness=(150.0, 400.0), search_states=search_at, axis_weight=AXIS_WEIGHT

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from sighted import AXIS, sighted, template
+from sliding import OUT, UP, cabinet, placements, seen
 from strategies import generator
 
 from scapo.axis_search import Posed
@@ -43,6 +46,17 @@ def test_a_start_along_a_wrong_axis_is_not_the_leader():
     tried = [(wrong, trusted), (right, trusted)]
     assert leaders(tried, views, 1, config) == [(right, trusted)]
     assert leaders(tried[:1], views, 1, config) == tried[:1]
+
+
+@pytest.mark.slow
+def test_a_sliding_joint_along_a_wrong_axis_is_put_right():
+    truth = placements(24)
+    truth = replace(truth, state=0.6 * truth.state)
+    views, wrong = seen(cabinet(UP, 7, 4000), truth), cabinet(UP)
+    trusted = improve(wrong, Trusted(views=views, placement=truth), generator(0), rounds=2)
+    assert axis_angle(wrong.directions()[0].detach(), OUT).rad2deg() < 10
+    opened = torch.stack([trusted.placement.state[:, 0], truth.shift[:, 0] @ OUT])
+    assert torch.corrcoef(opened)[0, 1].abs() > 0.9
 
 
 def test_views_that_judge_are_held_out():
