@@ -40,13 +40,14 @@ def improve(
 ) -> Trusted:
     """Rebuild parts and fit template, joints and placements to the trusted views."""
     placement, views = trusted.placement, trusted.views
-    sliding = "prismatic" in template.kinds
-    states = range_of(placement.state, template.kinds).wider(0.0 if sliding else 0.25).grid(11)
+    sliding, states = "prismatic" in template.kinds, None
     for number in range(rounds):
         rebuild(template, views, placement, generator=generator)
         placement = along_main_directions(template, placement)
         if number == 0:  # a start whose parts were poor may have taken a wrong way out
             placement = choose_axes(template, placement, torch.eye(3))
+            around = range_of(placement.state, template.kinds)
+            states = around.wider(0.0 if sliding else 0.25).grid(11)
         search_at = (0,) if sliding or number < rounds // 2 else ()
         options = FitOptions(
             steps=25, sharpness=(150.0, 400.0), search_states=search_at, axis_weight=AXIS_WEIGHT
