@@ -18,7 +18,7 @@ from scapo.layout import StoreError
 from scapo.method import AbstractMethod
 from scapo.model import Scapo, ScapoConfig, cpu_config
 from scapo.registered import RegisteredScapo
-from scapo.registered import cpu_config as cpu_registered
+from scapo.registered_config import cpu_config as cpu_registered
 from scapo.types import Category
 
 

@@ -67,9 +67,11 @@ class Train(Generic[M]):
         device = own_device(pick_device(self.device))
         try:
             with joined(device) as ranks:
-                self._fit(device, console if ranks.first else Console(quiet=True))
-                if ranks.first:
-                    write_report(self.out)
+                try:
+                    self._fit(device, console if ranks.first else Console(quiet=True))
+                finally:  # a run that stops early has its page too
+                    if ranks.first and (self.out / WEIGHTS).is_file():
+                        write_report(self.out)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(f"{self.out}: interrupted; {kept(self.out)}") from stop
         if ranks.first:

@@ -22,7 +22,7 @@ from scapo.pose_search import Finalists, Found, SearchSpace, search
 from scapo.registration import rotation_grid
 from scapo.sightings import Views
 from scapo.sliding_gauge import choose_axes
-from scapo.starts import AXIS_WEIGHT, DiscoveryConfig, Start, Trusted, common_frame, starts
+from scapo.starts import DiscoveryConfig, Start, Trusted, common_frame, starts
 from scapo.state_range import narrowest, range_of
 from scapo.template import ArticulatedTemplate
 from scapo.types import JointKind
@@ -36,21 +36,30 @@ def trust_order(found: Found) -> Int[Tensor, " B"]:
 
 
 def improve(
-    template: ArticulatedTemplate, trusted: Trusted, generator: torch.Generator, rounds: int = 4
+    template: ArticulatedTemplate,
+    trusted: Trusted,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+    rounds: int = 4,
 ) -> Trusted:
     """Rebuild parts and fit template, joints and placements to the trusted views."""
     placement, views = trusted.placement, trusted.views
     sliding, states = "prismatic" in template.kinds, None
     for number in range(rounds):
         rebuild(template, views, placement, generator=generator)
-        placement = along_main_directions(template, placement)
-        if number == 0:  # a start whose parts were poor may have taken a wrong way out
-            placement = choose_axes(template, placement, torch.eye(3))
+        if config.held_frame:
+            placement = along_main_directions(template, placement)
+        if number == 0:
+            if config.way_out:  # a start whose parts were poor may have taken a wrong one
+                placement = choose_axes(template, placement, torch.eye(3))
             around = range_of(placement.state, template.kinds)
             states = around.wider(0.0 if sliding else 0.25).grid(11)
         search_at = (0,) if sliding or number < rounds // 2 else ()
         options = FitOptions(
-            steps=25, sharpness=(150.0, 400.0), search_states=search_at, axis_weight=AXIS_WEIGHT
+            steps=25,
+            sharpness=(150.0, 400.0),
+            search_states=search_at,
+            axis_weight=config.axis_weight,
         )
         placement, _ = fit(template, views, placement, options, states=states, generator=generator)
     return Trusted(views=views, placement=placement)
@@ -78,8 +87,8 @@ def unexplained(
     The range counts because a joint along a wrong axis explains almost as much with more of it.
     """
     finalists = search_all(template, views, trusted, config)
-    states = narrowest(finalists.placement, finalists.loss, template.kinds)
-    return float(finalists.best(states).loss.mean()) + states.cost()
+    states = narrowest(finalists.placement, finalists.loss, template.kinds, config.range_cost)
+    return float(finalists.best(states).loss.mean()) + config.range_cost * states.extent()
 
 
 def leaders(tried: list[Start], held: Views, count: int, config: DiscoveryConfig) -> list[Start]:
@@ -110,10 +119,11 @@ def advance(
     """One round: search all views, and fit the template to the share that is trusted most."""
     template, trusted = start
     finalists = search_all(template, searched, trusted, config)
-    found = finalists.best(narrowest(finalists.placement, finalists.loss, template.kinds))
+    states = narrowest(finalists.placement, finalists.loss, template.kinds, config.range_cost)
+    found = finalists.best(states)
     kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
     trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
-    return template, improve(template, trusted, generator)
+    return template, improve(template, trusted, config, generator)
 
 
 def discover(

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import roma
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.points import gather
@@ -27,6 +27,15 @@ SHIFTS = tuple(0.05 * k for k in range(-5, 6))
 """Places of a sliding part across its joint's axis that are tried; the mean radius is 0.25."""
 NORMAL_LENGTH = 0.06
 """A unit of normal difference counts as this length when neighbours are sought."""
+POINTS = 128
+"""Of each view, drawn anew every step of `fit`."""
+SCALE_WEIGHT = 0.05
+"""Of the squared log scales."""
+SHIFT_WEIGHT = 0.2
+"""Of a sliding part's squared place across its axis, per squared normalised length."""
+SLIDE_WEIGHT = 0.7
+"""Of a sliding joint's states about their mean: without it a part slides right through the body to
+explain its far side."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,21 +45,8 @@ class FitOptions:
     steps: int = 40
     sharpness: tuple[float, float] = (120.0, 300.0)
     """Of the robust distance, per squared normalised length, at the beginning and the end."""
-    points: int = 128
-    """Of each view, drawn anew every step."""
-    rate: float = 1.0
-    """Factor on all learning rates."""
-    backward: float = 1.0
-    """Weight of what the camera should have seen."""
     search_states: tuple[int, ...] = ()
     """Steps at which every state is searched over `states`."""
-    scale_weight: float = 0.05
-    """Of the squared log scales."""
-    shift_weight: float = 0.2
-    """Of a sliding part's squared place across its axis, per squared normalised length."""
-    slide_weight: float = 0.7
-    """Of a sliding joint's states about their mean: without it a part slides right through the body
-    to explain its far side."""
     axis_weight: float = 0.0
     """Pull of each joint axis to the nearest axis of the template frame, a Manhattan frame."""
 
@@ -88,13 +84,20 @@ def view_loss(
     cosine = (views.normals * gather(normals, index)).sum(-1)
     there = 1 - torch.exp(-sharpness * off - NORMAL_WEIGHT * (1 - cosine))
     with torch.no_grad():
-        free, hidden = free_and_hidden(views, points, 0.03)
-        ray = F.normalize(views.camera[:, None] - points, dim=-1)
-        faces = (normals * ray).sum(-1) > 0.1
-        counts = (free | (faces & ~hidden)).to(points.dtype)
+        counts = should_be_seen(views, points, normals).to(points.dtype)
         back = oriented_nearest(points, normals, views.points, views.normals)
     off = (points - gather(views.points, back)).square().sum(-1)
     return there.mean(-1) + backward * ((1 - torch.exp(-sharpness * off)) * counts).mean(-1)
+
+
+@torch.no_grad()
+def should_be_seen(
+    views: Views, points: Float[Tensor, "B M 3"], normals: Float[Tensor, "B M 3"]
+) -> Bool[Tensor, "B M"]:
+    """Whether the camera would have seen each placed template point."""
+    free, hidden = free_and_hidden(views, points, 0.03)
+    ray = F.normalize(views.camera[:, None] - points, dim=-1)
+    return free | (((normals * ray).sum(-1) > 0.1) & ~hidden)
 
 
 def thin(views: Views, index: Int[Tensor, " K"]) -> Views:
@@ -164,7 +167,7 @@ def _best_option(
 class _Free:
     """The placement's variables while it is optimised: the rotation as a turn of the start."""
 
-    def __init__(self, start: Placement, template: ArticulatedTemplate, rate: float) -> None:
+    def __init__(self, start: Placement, template: ArticulatedTemplate) -> None:
         self.start = start
         self.turn = torch.zeros_like(start.translation).requires_grad_()
         self.translation = start.translation.detach().clone().requires_grad_()
@@ -180,7 +183,7 @@ class _Free:
             (self.state, state_rate),
             (self.shift, 0.006),
         )
-        self.groups = [{"params": [p], "lr": lr * rate} for p, lr in rates]
+        self.groups = [{"params": [p], "lr": lr} for p, lr in rates]
 
     def placement(self, axis: Float[Tensor, "J 3"]) -> Placement:
         along = (self.shift * axis).sum(-1, keepdim=True) * axis
@@ -207,8 +210,8 @@ def fit(
     Returns:
         The placements and the loss of each view at the last step.
     """
-    free = _Free(start, template, options.rate)
-    groups = [*free.groups, *_shared_groups(template, options.rate)]
+    free = _Free(start, template)
+    groups = [*free.groups, *_shared_groups(template)]
     optimiser = torch.optim.Adam(groups, betas=(0.8, 0.95))
     rates = [group["lr"] for group in groups]
     loss = start.translation.new_zeros(len(start.translation))
@@ -219,7 +222,7 @@ def fit(
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
             group["lr"] = rate * min(1.0, max(0.1, (1 - done) / 0.4))
         index = torch.randperm(views.points.shape[1], generator=generator, device=generator.device)
-        some = thin(views, index[: options.points])
+        some = thin(views, index[:POINTS])
         if states is not None and step in options.search_states:
             found = search_states(
                 template, some, free.placement(template.directions()), states, sharpness
@@ -227,7 +230,7 @@ def fit(
             free.state.data.copy_(found.state)
             free.shift.data.copy_(found.shift)
         placement = free.placement(template.directions())
-        loss = view_loss(some, template.place(placement), sharpness, options.backward)
+        loss = view_loss(some, template.place(placement), sharpness)
         total = loss.mean() + _gauge(template, placement, options)
         optimiser.zero_grad()
         total.backward()
@@ -237,14 +240,14 @@ def fit(
     return placement.detach(), loss.detach()
 
 
-def _shared_groups(template: ArticulatedTemplate, rate: float) -> list[dict[str, object]]:
+def _shared_groups(template: ArticulatedTemplate) -> list[dict[str, object]]:
     rates = (
         (template.points, 0.002),
         (template.logit, 0.06),
         (template.axis, 0.05),
         (template.pivot, 0.012),
     )
-    return [{"params": [p], "lr": lr * rate} for p, lr in rates]
+    return [{"params": [p], "lr": lr} for p, lr in rates]
 
 
 def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOptions) -> Tensor:
@@ -254,12 +257,12 @@ def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOpti
     axis that leans far to a third side; axes of made things mostly follow their main directions.
     """
     scale = placement.log_scale
-    gauge = options.scale_weight * scale.square().sum(-1).mean()
+    gauge = SCALE_WEIGHT * scale.square().sum(-1).mean()
     gauge = gauge + 0.5 * scale.mean(0).square().sum()
     gauge = gauge + 0.02 * placement.state.mean(0).square().sum()
-    gauge = gauge + options.shift_weight * placement.shift.square().sum((1, 2)).mean()
+    gauge = gauge + SHIFT_WEIGHT * placement.shift.square().sum((1, 2)).mean()
     spread = (placement.state - placement.state.mean(0)).square() @ slides(template)
-    gauge = gauge + options.slide_weight * spread.mean()
+    gauge = gauge + SLIDE_WEIGHT * spread.mean()
     askew = 1 - template.directions().square().amax(-1)
     gauge = gauge + options.axis_weight * askew.sum()
     mass = template.logit.softmax(-1).mean(0)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -60,6 +61,43 @@ def evenly(total: int, count: int | None) -> Int[Tensor, " K"]:
     if count is None or total <= count:
         return torch.arange(total)
     return torch.linspace(0, total - 1, count).long()
+
+
+def changes(
+    config: Any,  # noqa: ANN401 - a dataclass
+    default: Any,  # noqa: ANN401
+    leave: Collection[str] = (),
+) -> list[str]:
+    """Options of a configuration that differ from the default, as words of a variant's name.
+
+    Sizes and counts (whole numbers, tuples of them) make no other variant.
+
+    Args:
+        config: A dataclass, of dataclasses perhaps.
+        default: Another of the same type.
+        leave: Dotted names of fields that do not count.
+
+    >>> from scapo.starts import DiscoveryConfig
+    >>> changed = DiscoveryConfig(draws=1, axis_weight=0.0, way_out=False)
+    >>> changes(changed, DiscoveryConfig(), leave=["axis_weight"])
+    ['way_out=False']
+    """
+    words = []
+    for name in (f.name for f in fields(config)):
+        here, there = getattr(config, name), getattr(default, name)
+        if name in leave or here == there or _counts(here):
+            continue
+        if is_dataclass(here):
+            below = [x.removeprefix(f"{name}.") for x in leave]
+            words += [f"{name}.{word}" for word in changes(here, there, below)]
+        else:
+            words.append(f"{name}={here}")
+    return words
+
+
+def _counts(value: object) -> bool:
+    many = value if isinstance(value, tuple) else (value,)
+    return all(isinstance(one, int) and not isinstance(one, bool) for one in many)
 
 
 class AbstractMethod(nn.Module, ABC):

@@ -32,7 +32,7 @@ from scapo.articulation import (
 from scapo.augment import random_pose
 from scapo.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig
 from scapo.geometry import apply, rigid
-from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
 from scapo.model_pictures import articulated_pictures, canonical_pictures
 from scapo.objectives import Explanation, LossConfig, articulation, canonicalisation
 from scapo.opalign_record import opalign_record
@@ -40,9 +40,11 @@ from scapo.pictures import PictureData
 from scapo.points import Similarity, normalise
 from scapo.refine import refine
 from scapo.skinning import Bones, cross_maps, part_maps
-from scapo.types import Category, JointKind, Joints, Labels, Observation, Prediction, Supervision
+from scapo.types import Category, JointKind, Joints, Labels, Observation, Prediction
 from scapo.vector_neurons import initialise
 
+UNNAMED = frozenset({"preset", "supervision", "loss.without", "lr", "min_lr", "weight_decay"})
+"""Options with names of their own in a variant, or that make no other."""
 CANONICALISE = "canonicalise"
 ARTICULATE = "articulate"
 
@@ -64,8 +66,8 @@ class ScapoConfig:
     """Y_base and K: the decoded medoid of the training codes, or random numbers."""
     encoder_in_stage_2: Literal["joint", "frozen"] = "joint"
     """joint: frozen for the first half, then a tenth of the rate."""
-    supervision: tuple[Supervision, ...] = ()
-    """Labels that training may see: (), or (segmentation, joint) as in Table 2."""
+    supervision: tuple[Literal["segmentation", "joint"], ...] = ()
+    """Labels that training may see: both in Table 2."""
     epochs: tuple[int, ...] = (200, 200)
     """Of each stage; one number for both."""
     lr: tuple[float, float] = (1e-3, 1e-4)
@@ -130,11 +132,14 @@ class Scapo(AbstractMethod):
 
     @property
     def variant(self) -> str:
-        """The preset, SJ for the supervised variant, and the ablated terms."""
+        """The preset, S and J for the labels used, other options, and the ablated terms."""
         config = self.config
+        preset = ScapoConfig() if config.preset == "paper" else cpu_config()
         words = [] if config.preset == "paper" else [config.preset]
-        words += ["SJ"] if config.supervision else []
-        return "-".join([*words, *(f"wo_{term}" for term in config.loss.without)])
+        words += ["".join(sorted(label[0].upper() for label in config.supervision))[::-1]]
+        words += changes(config, preset, leave=UNNAMED)
+        words += [f"wo_{term}" for term in config.loss.without]
+        return "-".join(word for word in words if word)
 
     def stages(self) -> tuple[Stage, ...]:
         """Two stages of Adam with cosine annealing (Sec. 4)."""

@@ -14,17 +14,27 @@ from dataclasses import dataclass, replace
 import roma
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo.joint_fit import oriented_nearest
+from scapo.joint_fit import (
+    SCALE_WEIGHT,
+    SHIFT_WEIGHT,
+    SLIDE_WEIGHT,
+    oriented_nearest,
+    should_be_seen,
+)
 from scapo.points import gather
 from scapo.registration import NORMAL_WEIGHT
-from scapo.sightings import Views, free_and_hidden
+from scapo.sightings import Views
 from scapo.template import ArticulatedTemplate, Placement
 
 ALONG = 0.25
 """Weight of distances along the surface beside those across it."""
+SHARPNESS = (80.0, 250.0)
+"""Of the robust distance, per squared normalised length, at the first and the last step."""
+DAMPING = 0.02
+"""Share of the system's diagonal that is added to it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,21 +42,10 @@ class StepOptions:
     """Of one call of `settle`."""
 
     steps: int = 6
-    sharpness: tuple[float, float] = (80.0, 250.0)
-    """Of the robust distance, per squared normalised length, at the first and the last step."""
     points: int = 96
     """Of each view, the same in every step: they come in the order of farthest-point sampling."""
     template_points: int = 128
     """Asked whether the camera would have seen them."""
-    backward: float = 1.0
-    scale_weight: float = 0.05
-    """Of the squared log scales."""
-    shift_weight: float = 0.2
-    """Of a sliding part's squared place across its axis, per squared normalised length."""
-    slide_weight: float = 0.7
-    """Of a sliding joint's squared state: about 0, where `joint_fit` has the views' mean."""
-    damping: float = 0.02
-    """Share of the system's diagonal that is added to it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +124,7 @@ def settle(
     view_points = views.points[:, : options.points]
     view_normals = views.normals[:, : options.points]
     for step in range(options.steps):
-        low, high = options.sharpness
+        low, high = SHARPNESS
         sharpness = low * (high / low) ** (step / max(options.steps - 1, 1))
         points, normals = template.place(placement)
         match = oriented_nearest(view_points, view_normals, points, normals)
@@ -139,20 +138,10 @@ def settle(
         cosine = (placed.normals[:, :count] * view_normals).sum(-1)
         near = torch.exp(-sharpness * off.square().sum(-1))
         there = near[:, :count] * torch.exp(-NORMAL_WEIGHT * (1 - cosine)) / count
-        seen = _should_be_seen(views, back_points, back_normals)
-        missed = options.backward * near[:, count:] * seen / len(some)
+        missed = near[:, count:] * should_be_seen(views, back_points, back_normals) / len(some)
         weight = sharpness * torch.cat([there, missed], 1)
-        placement = _step(template, placement, placed.jacobian, (off, normal, weight), options)
+        placement = _step(template, placement, placed.jacobian, (off, normal, weight))
     return placement
-
-
-def _should_be_seen(
-    views: Views, points: Float[Tensor, "H M 3"], normals: Float[Tensor, "H M 3"]
-) -> Bool[Tensor, "H M"]:
-    """Whether the camera would have seen each placed template point."""
-    free, hidden = free_and_hidden(views, points, 0.03)
-    ray = F.normalize(views.camera[:, None] - points, dim=-1)
-    return free | (((normals * ray).sum(-1) > 0.1) & ~hidden)
 
 
 def _step(
@@ -160,7 +149,6 @@ def _step(
     placement: Placement,
     jacobian: Float[Tensor, "H N D 3"],
     residual: tuple[Float[Tensor, "H N 3"], Float[Tensor, "H N 3"], Float[Tensor, "H N"]],
-    options: StepOptions,
 ) -> Placement:
     """Solve for one damped step and take it.
 
@@ -169,7 +157,6 @@ def _step(
         placement: Where the step starts.
         jacobian: Of the points.
         residual: Point minus target, the target's normal, and the weight of the match.
-        options: Priors and damping.
     """
     off, normal, weight = residual
     root = weight.sqrt()
@@ -181,26 +168,29 @@ def _step(
     )
     system = rows.mT @ rows
     gradient = (rows.mT @ right[..., None])[..., 0]
-    prior, value = _priors(template, placement, options)
+    prior, value = _priors(template, placement)
     gradient = gradient + prior * value
     diagonal = system.diagonal(dim1=-2, dim2=-1)
-    system = system + torch.diag_embed(prior + options.damping * diagonal + 0.2)
+    system = system + torch.diag_embed(prior + DAMPING * diagonal + 0.2)
     step = -torch.linalg.solve(system, gradient)
     return _move(template, placement, step)
 
 
 def _priors(
-    template: ArticulatedTemplate, placement: Placement, options: StepOptions
+    template: ArticulatedTemplate, placement: Placement
 ) -> tuple[Float[Tensor, " D"], Float[Tensor, "H D"]]:
-    """Weight of each coordinate's square in the loss, and the coordinate's value."""
+    """Weight of each coordinate's square in the loss, and the coordinate's value.
+
+    A sliding joint's states are held about 0, where `joint_fit` has the views' mean.
+    """
     none = torch.zeros_like(placement.translation)
     value = [none, none, placement.log_scale, placement.state]
-    weight = [0.0] * 6 + [options.scale_weight] * 3
-    weight += [options.slide_weight * (kind == "prismatic") for kind in template.kinds]
+    weight = [0.0] * 6 + [SCALE_WEIGHT] * 3
+    weight += [SLIDE_WEIGHT * (kind == "prismatic") for kind in template.kinds]
     for j, kind in enumerate(template.kinds):
         if kind == "prismatic":
             value.append(placement.shift[:, j])
-            weight += [options.shift_weight] * 3
+            weight += [SHIFT_WEIGHT] * 3
     return torch.tensor(weight).to(none), torch.cat(value, 1)
 
 

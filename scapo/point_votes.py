@@ -48,7 +48,7 @@ class PointVotes(nn.Module):
 
     def __init__(self, parts: int, joints: int, *, width: int = 48, neighbours: int = 12) -> None:
         super().__init__()
-        self.parts, self.joints, self.neighbours = parts, joints, neighbours
+        self.joints, self.neighbours = joints, neighbours
         w = width
         self.edge = nn.Sequential(nn.Linear(9, w), nn.ReLU(), nn.Linear(w, w))
         self.local = _block(w + 3, 2 * w)

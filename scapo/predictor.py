@@ -16,7 +16,8 @@ from scapo.files import Arrays, Header
 from scapo.layout import StoreError
 from scapo.method import Mode
 from scapo.model import Scapo, ScapoConfig
-from scapo.registered import RegisteredConfig, RegisteredScapo
+from scapo.registered import RegisteredScapo
+from scapo.registered_config import RegisteredConfig
 from scapo.types import Joints, Observation, Prediction
 
 RELEASED = "weights"
@@ -51,14 +52,15 @@ class Predictor:
             are.
 
         Raises:
-            ValueError: Another shape, fewer points than the encoder's neighbours, values that
-                are not finite.
+            ValueError: Another shape, no cloud, fewer points than the encoder's neighbours,
+                values that are not finite.
         """
         cloud = torch.as_tensor(points, dtype=torch.float32, device=self.device)
-        if cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < self.least:
+        short = cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < self.least
+        if short or cloud.numel() == 0:
             raise ValueError(
-                f"points: expected shape (..., N, 3) with N at least {self.least}, "
-                f"found {tuple(cloud.shape)}"
+                f"points: expected shape (..., N, 3) with N at least {self.least} and at least one "
+                f"cloud, found {tuple(cloud.shape)}"
             )
         shape = cloud.shape[:-2]
         flat = cloud.reshape(-1, *cloud.shape[-2:])
@@ -126,21 +128,19 @@ def find(path_or_category: str | Path) -> Path:
 
 
 def _reshaped(prediction: Prediction, shape: torch.Size) -> Prediction:
-    def back(tensor: Tensor | None) -> Tensor | None:
-        return None if tensor is None else tensor.reshape(*shape, *tensor.shape[1:]).cpu()
+    def back(tensor: Tensor) -> Tensor:
+        return tensor.reshape((*shape, *tensor.shape[1:])).cpu()
+
+    def back_if(tensor: Tensor | None) -> Tensor | None:
+        return None if tensor is None else back(tensor)
 
     joints = prediction.joints
     if joints is not None:
-        joints = Joints(
-            pivot=joints.pivot.reshape(*shape, *joints.pivot.shape[1:]).cpu(),
-            axis=joints.axis.reshape(*shape, *joints.axis.shape[1:]).cpu(),
-            state=joints.state.reshape(*shape, *joints.state.shape[1:]).cpu(),
-        )
-    weight = prediction.part_weight
+        joints = Joints(pivot=back(joints.pivot), axis=back(joints.axis), state=back(joints.state))
     return Prediction(
-        part_weight=weight.reshape(*shape, *weight.shape[1:]).cpu(),
-        camera_T_part=back(prediction.camera_T_part),
+        part_weight=back(prediction.part_weight),
+        camera_T_part=back_if(prediction.camera_T_part),
         joints=joints,
-        canonical_points=back(prediction.canonical_points),
-        confidence=back(prediction.confidence),
+        canonical_points=back_if(prediction.canonical_points),
+        confidence=back_if(prediction.confidence),
     )

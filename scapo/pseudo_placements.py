@@ -85,5 +85,6 @@ class PseudoPlacements(nn.Module):
         """Take the size of what is loaded."""
         for name in (*self.NAMES, "belonging"):
             if prefix + name in state_dict:
-                setattr(self, name, torch.zeros_like(state_dict[prefix + name]))
+                empty = torch.zeros_like(state_dict[prefix + name], device=self.key.device)
+                setattr(self, name, empty)
         super()._load_from_state_dict(state_dict, prefix, *rest, **named)

@@ -15,17 +15,16 @@ network believes it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import roma
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from scapo.discovery import discover, search_all, trust_order
-from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.pictures import PictureData
 from scapo.placed import nearest_weights, placed_prediction
 from scapo.point_votes import PointVotes, Target, Votes, principal_frames, procrustes, vote_losses
@@ -38,12 +37,12 @@ from scapo.pose_search import (
     tournament,
 )
 from scapo.pseudo_placements import PseudoPlacements
+from scapo.registered_config import RegisteredConfig
 from scapo.registered_pictures import template_pictures
 from scapo.registration import rotation_grid
 from scapo.sightings import Views, observe
-from scapo.starts import DiscoveryConfig
 from scapo.state_range import StateRange, range_of
-from scapo.stray_points import belongs, replaced, without_strays
+from scapo.stray_points import belongs, replaced
 from scapo.template import (
     ArticulatedTemplate,
     Placement,
@@ -53,28 +52,8 @@ from scapo.template import (
 )
 from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegisteredConfig:
-    """SCAPO by registration and joint fit."""
-
-    discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    learned: int = 600
-    """Training clouds whose placements the network learns, 0.25 s each on one core."""
-    trusted: float = 0.85
-    """Share of them that it learns from."""
-    epochs: int = 60
-    """Of the network."""
-    lr: float = 1e-3
-    batch: int = 32
-    width: int = 48
-    """Of the network; 48 gives 0.2 million parameters."""
-    points: int = 256
-    """Of each cloud."""
-    grid_hypotheses: int = 64
-    """Placements of a grid search that `refine` tries beside the network's four; 0 for none."""
-    camera: Literal["known", "estimated"] = "known"
-    """Whether `refine` takes the camera from the cloud's frame or from the network."""
+LEAST_CLOUDS = 8
+"""Views that a template can be found in at all, two of which judge."""
 
 
 class RegisteredScapo(AbstractMethod):
@@ -92,16 +71,17 @@ class RegisteredScapo(AbstractMethod):
         kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         self.template = ArticulatedTemplate(kinds, config.discovery.template_points)
         self.network = PointVotes(len(category.parts), len(kinds), width=config.width)
-        for parameter in self.network.parameters():
-            if parameter.dim() > 1:
-                bound = parameter.shape[1] ** -0.5
-                nn.init.uniform_(parameter, -bound, bound, generator=generator)
+        for layer in self.network.modules():
+            if isinstance(layer, nn.Linear):
+                bound = layer.in_features**-0.5
+                for parameter in layer.parameters():
+                    nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.pseudo = PseudoPlacements()
 
     @property
     def variant(self) -> str:
-        """Named switches that differ from the default."""
-        return "" if self.config.camera == "known" else "camera estimated"
+        """Options that differ from the default, but for how much is trained."""
+        return " ".join(changes(self.config, RegisteredConfig(), leave=("lr",)))
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's; the template is found before it starts."""
@@ -121,9 +101,14 @@ class RegisteredScapo(AbstractMethod):
     ) -> None:
         """Find the template, and its placement in the clouds that the network will learn."""
         del stage, labels
+        if len(observation.points) < LEAST_CLOUDS:
+            raise ValueError(
+                f"training data: expected at least {LEAST_CLOUDS} clouds, "
+                f"found {len(observation.points)}"
+            )
         index = evenly(len(observation.points), self.config.learned)
         cloud = observation.points[index.to(observation.points.device)].cpu()
-        belonging = belongs(cloud)
+        belonging = self._belongs(cloud)
         points, similarity = normalise(replaced(cloud, belonging))
         camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
         views = observe(points, camera, count=self.config.points)
@@ -134,6 +119,12 @@ class RegisteredScapo(AbstractMethod):
         self._set_pseudo(cloud[:, 0], views, found)
         self.pseudo.belonging = belonging
         self.to(device)
+
+    def _belongs(self, cloud: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
+        """Which points belong to the object, or all of them."""
+        if self.config.strays == "kept":
+            return torch.ones(cloud.shape[:2], dtype=torch.bool, device=cloud.device)
+        return belongs(cloud)
 
     def _discover(self, views: Views, generator: torch.Generator) -> Found:
         template, trusted = discover(views, self.template.kinds, self.config.discovery, generator)
@@ -158,12 +149,16 @@ class RegisteredScapo(AbstractMethod):
         points, _ = normalise(replaced(observation.points, self.pseudo.belonging[row]))
         device = points.device
         index = torch.randperm(points.shape[1], generator=step.generator, device=device)
-        points = points[:, index[: 2 * self.config.points]]
-        points = gather(points, farthest_points(points, self.config.points))
+        points = self._thinned(points[:, index[: 2 * self.config.points]])
         frame = self._random_frames(points, step.generator)
         noise = torch.randn(points.shape, generator=step.generator, device=device) * 0.003
         votes = self.network((points + noise) @ frame.mT)
         return vote_losses(votes, self._target(points, row))
+
+    def _thinned(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B K 3"]:
+        """`config.points` of each cloud by farthest-point sampling, or all."""
+        count = min(self.config.points, points.shape[1])
+        return gather(points, farthest_points(points, count))
 
     def _random_frames(
         self, points: Float[Tensor, "B K 3"], generator: torch.Generator
@@ -212,8 +207,9 @@ class RegisteredScapo(AbstractMethod):
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
         """The template over its states, and where the network places it."""
         del stage
-        points, _ = normalise(without_strays(observation.points))
-        kept = gather(points, farthest_points(points, self.config.points))
+        cloud = observation.points
+        points, _ = normalise(replaced(cloud, self._belongs(cloud)))
+        kept = self._thinned(points)
         placement, (_, sure) = self._hypotheses(kept)
         row = torch.arange(len(points), device=points.device) * 4 + sure.argmax(1)
         return template_pictures(self.template, self._states(), kept, placement.take(row))
@@ -221,9 +217,9 @@ class RegisteredScapo(AbstractMethod):
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Parts, poses and joints; part frames sit at the middle of the template's base."""
-        clean, similarity = normalise(without_strays(observation.points))
-        points = similarity.forward(observation.points)
-        kept = gather(clean, farthest_points(clean, self.config.points))
+        cloud = observation.points.to(self.template.points)
+        clean, similarity = normalise(replaced(cloud, self._belongs(cloud)))
+        points, kept = similarity.forward(cloud), self._thinned(clean)
         placement, (votes, sure) = self._hypotheses(kept)
         best = sure.argmax(1)
         every = torch.arange(len(points), device=points.device)
@@ -269,7 +265,9 @@ class RegisteredScapo(AbstractMethod):
             start.append(propose(self.template, views, space))
         finalists = tournament(self.template, views, interleave(start, len(points)), space.states)
         found = finalists.best(self._states().wider(0.1))
-        final = settle_states(self.template, views, found, self._states())
+        final = found.placement
+        if self.config.settle:
+            final = settle_states(self.template, views, found, self._states())
         return turn_placement(final, frame.mT), found.margin
 
     def _states(self) -> StateRange:
@@ -285,8 +283,3 @@ class RegisteredScapo(AbstractMethod):
             cameras=F.normalize(self.pseudo.camera[trusted], dim=-1),
             keep=self.config.grid_hypotheses,
         )
-
-
-def cpu_config() -> RegisteredConfig:
-    """Trains one category in at most 20 minutes on two cores."""
-    return RegisteredConfig()

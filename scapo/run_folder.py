@@ -127,7 +127,9 @@ class RunFolder:
         *,
         finished: bool = False,
     ) -> None:
-        """First the state that resume reads, whole in one file, then the weights alone.
+        """First the weights alone, then the state that resume reads, whole in one file.
+
+        In that order a run whose state says that it is finished has its weights.
 
         Args:
             state: Of this rank, the first.
@@ -147,7 +149,6 @@ class RunFolder:
             "optimizer": optimizer is not None,
             "header": header,
         }
-        write(self.path / checkpoint.TRAINING, arrays, training)
         checkpoint.write_checkpoint(self.path / checkpoint.WEIGHTS, self.method, header)
         timing = {
             "seconds": state.position.seconds,
@@ -155,6 +156,7 @@ class RunFolder:
             "stage_seconds": state.position.spent,
         }
         write_bytes(self.path / TIMING, (json.dumps(timing, indent=1) + "\n").encode())
+        write(self.path / checkpoint.TRAINING, arrays, training)
 
 
 def noise_name(rank: int) -> str:

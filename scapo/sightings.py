@@ -60,9 +60,9 @@ def observe(
     Args:
         points: Mean radius 0.25 about the origin.
         camera: The camera's centre in the same frame; estimated or known.
-        count: Points kept.
+        count: Points kept, or all where there are fewer.
     """
-    kept = gather(points, farthest_points(points, count))
+    kept = gather(points, farthest_points(points, min(count, points.shape[1])))
     look = _look(camera)
     depth, centre, half = _depth_image(points, camera, look)
     return Views(

@@ -22,11 +22,9 @@ from scapo.part_evidence import farthest_features, rebuild
 from scapo.registration import register_pairs, rotation_grid
 from scapo.sightings import Views
 from scapo.sliding_gauge import choose_axes
+from scapo.state_range import RANGE_COST
 from scapo.template import ArticulatedTemplate, Placement
 from scapo.types import JointKind
-
-AXIS_WEIGHT = 1.0
-"""Of `FitOptions.axis_weight` once a start is chosen: before, wrong axes must be free to turn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +53,21 @@ class DiscoveryConfig:
     """Shares kept in their rounds, on half of the views; then the best goes on alone."""
     judged: int = 48
     """Views held out for that."""
+    range_cost: float = RANGE_COST
+    """Mean loss that a radian of range may save; 0: any range of states."""
+    axis_weight: float = 1.0
+    """Pull of the axes to the main directions once a start is chosen (before, wrong axes must be
+    free to turn); 0: none."""
+    held_frame: bool = True
+    """Turn the template's frame to the main directions of its base in every round."""
+    way_out: bool = True
+    """Take for a sliding joint's axis the way out of the body."""
     template_points: int = 400
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a grid too coarse to rank its rotations."""
+        if self.rotations < 200:
+            raise ValueError(f"rotations: expected at least 200, found {self.rotations}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,14 +169,18 @@ def starts(
     for combination in product(*[found[:each] for found in guesses]):
         template = first_template(posed, moved, combination, kinds, config.template_points)
         placement = Placement.at(posed.rotation, posed.translation, none)
-        placement, loss = _first_rounds(template, posed.views, placement, generator)
+        placement, loss = _first_rounds(template, posed.views, placement, config, generator)
         tried.append((float(loss.mean()), template, placement))
     tried.sort(key=lambda start: start[0])
     return [(t, Trusted(views=posed.views, placement=placement)) for _, t, placement in tried]
 
 
 def _first_rounds(
-    template: ArticulatedTemplate, views: Views, placement: Placement, generator: torch.Generator
+    template: ArticulatedTemplate,
+    views: Views,
+    placement: Placement,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
 ) -> tuple[Placement, Float[Tensor, " B"]]:
     """Fit and rebuild a start; a sliding joint gets its axis after the first fit and keeps it."""
     kinds, axis_weight = template.kinds, 0.0
@@ -177,8 +193,9 @@ def _first_rounds(
             axis_weight=axis_weight,
         )
         placement, _ = fit(template, views, placement, options, states=states, generator=generator)
-        if number == 0 and "prismatic" in kinds:
-            placement, axis_weight = choose_axes(template, placement, torch.eye(3)), AXIS_WEIGHT
+        if number == 0 and config.way_out and "prismatic" in kinds:
+            placement = choose_axes(template, placement, torch.eye(3))
+            axis_weight = config.axis_weight
         rebuild(template, views, placement, generator=generator)
     options = FitOptions(steps=20, axis_weight=axis_weight)
     return fit(template, views, placement, options, generator=generator)

@@ -41,9 +41,9 @@ class StateRange:
         outside = (self.low - state).clamp_min(0) + (state - self.high).clamp_min(0)
         return (SLOPE * outside * self.unit).clamp_max(OUTSIDE_COST).sum(-1)
 
-    def cost(self) -> float:
-        """What the range itself costs."""
-        return RANGE_COST * float(((self.high - self.low) * self.unit).sum())
+    def extent(self) -> float:
+        """Radians, or mean radii of a sliding joint, of all joints together."""
+        return float(((self.high - self.low) * self.unit).sum())
 
     def wider(self, share: float) -> StateRange:
         """With room of a share of the range on both sides."""
@@ -73,7 +73,10 @@ def range_of(state: Float[Tensor, "B J"], kinds: tuple[JointKind, ...]) -> State
 
 @torch.no_grad()
 def narrowest(
-    placement: Placement, loss: Float[Tensor, "B F"], kinds: tuple[JointKind, ...]
+    placement: Placement,
+    loss: Float[Tensor, "B F"],
+    kinds: tuple[JointKind, ...],
+    cost: float = RANGE_COST,
 ) -> StateRange:
     """The range of least mean loss of the best hypotheses within, plus its cost.
 
@@ -81,10 +84,13 @@ def narrowest(
         placement: F hypotheses of each of B views, those of a view one after the other.
         loss: Of the hypotheses.
         kinds: Of the joints.
+        cost: Of a radian; 0 for the range of the best hypotheses as it is.
     """
     state = placement.state.unflatten(0, loss.shape)
     best = state[torch.arange(len(loss), device=loss.device), loss.argmin(1)]
     chosen = range_of(best, kinds)
+    if cost == 0:
+        return chosen
     for j in list(range(len(kinds))) * (2 if len(kinds) > 1 else 1):
         span = (chosen.high[j] - chosen.low[j]).clamp_min(1e-3)
         tried = []
@@ -97,7 +103,6 @@ def narrowest(
                 )
                 option = StateRange(low=low, high=high, unit=chosen.unit)
                 least = (loss + option.penalty(state)).amin(1).mean()
-                cost = least + RANGE_COST * width * span * chosen.unit[j]
-                tried.append((float(cost), option))
+                tried.append((float(least + cost * width * span * chosen.unit[j]), option))
         chosen = min(tried, key=lambda pair: pair[0])[1]
     return chosen

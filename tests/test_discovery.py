@@ -27,7 +27,7 @@ def test_the_joint_is_found_once_the_bases_are_in_one_frame():
     tried = starts(posed, ("revolute",), config, generator(0))
     assert len(tried) == 2
     found, trusted = leaders(tried, views.take(torch.arange(0, 20, 5)), 1, config)[0]
-    improve(found, trusted, generator(1), rounds=2)
+    improve(found, trusted, config, generator(1), rounds=2)
     assert axis_angle(found.directions()[0].detach(), AXIS).rad2deg() < 12
     state = torch.corrcoef(torch.stack([trusted.placement.state[:, 0], truth.state[:, 0]]))[0, 1]
     assert abs(state) > 0.8
@@ -53,7 +53,8 @@ def test_a_sliding_joint_along_a_wrong_axis_is_put_right():
     truth = placements(24)
     truth = replace(truth, state=0.6 * truth.state)
     views, wrong = seen(cabinet(UP, 7, 4000), truth), cabinet(UP)
-    trusted = improve(wrong, Trusted(views=views, placement=truth), generator(0), rounds=2)
+    start = Trusted(views=views, placement=truth)
+    trusted = improve(wrong, start, DiscoveryConfig(), generator(0), rounds=2)
     assert axis_angle(wrong.directions()[0].detach(), OUT).rad2deg() < 10
     opened = torch.stack([trusted.placement.state[:, 0], truth.shift[:, 0] @ OUT])
     assert torch.corrcoef(opened)[0, 1].abs() > 0.9

@@ -34,7 +34,8 @@ from bench.template_picture import state_steps, template_picture
 from bench.template_shape import TemplateShape, at_states, carried, template_shape
 from scapo.categories import category
 from scapo.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
-from scapo.registered import RegisteredConfig, RegisteredScapo
+from scapo.registered import RegisteredScapo
+from scapo.registered_config import RegisteredConfig
 
 
 def answered_of(folder, name="laptop", change=None, **header):

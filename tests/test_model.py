@@ -12,6 +12,7 @@ from strategies import generator, rigid_motions
 from tiny import TINY, tiny
 from torch.testing import assert_close
 
+from scapo.autoencoder import EncoderConfig
 from scapo.categories import CATEGORIES
 from scapo.geometry import apply, invert, is_rotation, joint_motion
 from scapo.method import Step
@@ -252,6 +253,12 @@ def test_variants_name_what_differs() -> None:
     assert Scapo(ScapoConfig(), CATEGORIES["laptop"], generator(0)).variant == ""
     without = replace(TINY, loss=replace(TINY.loss, without=("shape_var",)))
     assert tiny(config=without).variant == "cpu-wo_shape_var"
+    other = replace(TINY, gamma=0.02, supervision=("joint",), epochs=(1, 1))
+    assert tiny(config=other).variant == "cpu-J-gamma=0.02"
+    gram = ScapoConfig(encoder=EncoderConfig(projection="gram-schmidt"))
+    assert Scapo(gram, CATEGORIES["laptop"], generator(0)).variant == (
+        "encoder.projection=gram-schmidt"
+    )
 
 
 def test_both_stages_learn() -> None:

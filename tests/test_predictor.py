@@ -16,7 +16,8 @@ from scapo.categories import CATEGORIES
 from scapo.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.layout import StoreError
 from scapo.predictor import load
-from scapo.registered import RegisteredConfig, RegisteredScapo
+from scapo.registered import RegisteredScapo
+from scapo.registered_config import RegisteredConfig
 from scapo.types import Observation
 
 
@@ -72,3 +73,10 @@ def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
     found = load(tmp_path).predict(points, sensor=np.zeros(3))
     assert_close(found.part_weight, wanted.part_weight)
     assert_close(found.camera_T_part, wanted.camera_T_part)
+    one = load(tmp_path).predict(points[0].double().numpy())
+    assert_close(one.part_weight, wanted.part_weight[0])
+    assert_close(one.confidence, found.confidence[0])
+    few = load(tmp_path).predict(points[:, :40])
+    assert few.part_weight.shape == (2, 40, 2)
+    with pytest.raises(ValueError, match="at least one cloud, found"):
+        load(tmp_path).predict(np.zeros((0, 96, 3)))

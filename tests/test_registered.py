@@ -14,7 +14,8 @@ from scapo.categories import CATEGORIES
 from scapo.geometry import invert, random_rotations, rotation_angle
 from scapo.method import Step
 from scapo.points import squared_distances
-from scapo.registered import RegisteredConfig, RegisteredScapo
+from scapo.registered import RegisteredScapo
+from scapo.registered_config import RegisteredConfig
 from scapo.types import Labels, Observation, Prediction
 
 
@@ -60,7 +61,6 @@ def test_predictions_turn_and_move_with_the_cloud_and_survive_storage():
     assert_close(again.part_weight, plain.part_weight)
 
 
-@pytest.mark.slow
 def distance_to_template(prediction: Prediction, observation: Observation) -> Tensor:
     """Mean distance of each cloud to its template, after the predicted part poses are undone."""
     assert prediction.camera_T_part is not None
@@ -80,6 +80,13 @@ def test_refinement_brings_the_template_closer():
     after, before = (distance_to_template(one, observation) for one in (refined, fast))
     assert after.median() < before.median()
     assert torch.allclose(refined.part_weight.sum(-1), torch.tensor(1.0), atol=1e-4)
+
+
+def test_the_first_weights_come_from_the_seed_alone():
+    one, other = (
+        RegisteredScapo(RegisteredConfig(), CATEGORIES["oven"], generator(4)) for _ in range(2)
+    )
+    assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
 
 
 def test_one_stage_over_the_clouds_that_were_placed():

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from strategies import generator
 
-from scapo.stray_points import belongs, replaced, without_strays
+from scapo.stray_points import belongs, replaced
 
 
 def cloud(strays: int, seed: int = 0) -> torch.Tensor:
@@ -26,9 +26,27 @@ def test_strays_are_told_from_parts_that_stand_apart():
     assert belongs(cloud(0)[None]).float().mean() > 0.995
 
 
+def test_repeated_points_of_a_sparse_view_belong_together():
+    g = generator(5)
+    sparse = cloud(20, 2)[torch.randperm(820, generator=g)[:160]]
+    filled = sparse[torch.randint(160, (1024,), generator=g)]
+    found = belongs(filled[None])[0]
+    assert found[filled[:, 2] < 0.2].float().mean() > 0.98
+    assert belongs(torch.ones(1, 50, 3)).all()
+
+
+def test_large_clouds_are_told_by_their_neighbours():
+    g = generator(6)
+    large = cloud(20, 3).repeat(10, 1)
+    large = large + 0.0005 * torch.randn(large.shape, generator=g)
+    found = belongs(large[None])[0]
+    assert found[large[:, 2] < 0.3].float().mean() > 0.995
+    assert not found[large[:, 2] > 0.5].any()
+
+
 def test_strays_are_replaced_by_points_of_the_object():
     points = cloud(20)[None]
-    clean = without_strays(points)
+    clean = replaced(points, belongs(points))
     assert clean.shape == points.shape
     assert clean[0, :, 2].max() < 0.2
     mask = torch.tensor([[True, False, True, False, True]])
