@@ -20,6 +20,7 @@ from scapo.points import chamfer, gather, k_nearest, robust_chamfer, squared_dis
 
 ReconForm = Literal["squared", "partial", "robust"]
 VarianceForm = Literal["per-point", "whole"]
+KeypointMean = Literal["parts", "supported"]
 
 Scalar = Float[Tensor, ""]
 
@@ -80,11 +81,18 @@ def keypoint_segmentation(
     points: Float[Tensor, "B N 3"],
     weights: Float[Tensor, "B N P"],
     support: float = 20.0,
+    mean: KeypointMean = "parts",
 ) -> Scalar:
-    """L_kp-seg (Sec. 3.3): squared distance of keypoint and soft centroid where N_p > tau."""
+    """L_kp-seg (Sec. 3.3): squared distance of keypoint and soft centroid where N_p > tau.
+
+    `parts` divides by P as printed, `supported` by the parts with N_p > tau (ShapeMaker).
+    """
     centroids, count = soft_centroids(points, weights)
     distance = (keypoints - centroids).square().sum(-1)
-    return ((count.detach() > support) * distance).mean()
+    supported = (count.detach() > support).to(distance)
+    if mean == "supported":
+        return (supported * distance).sum() / supported.sum().clamp_min(1)
+    return (supported * distance).mean()
 
 
 def nearest_keypoint(

@@ -77,6 +77,7 @@ class LossConfig:
     proximity_neighbours: int = 1
     support: float = 20.0
     """tau of L_kp-seg, in points."""
+    support_mean: losses.KeypointMean = "parts"
     boundary_temperature: float = 1.0
     boundary_detach: bool = True
 
@@ -253,7 +254,8 @@ def keypoint_terms(
 
     return {
         "kp_seg": lambda: sum_of(
-            losses.keypoint_segmentation(*triple, config.support) for triple in triples
+            losses.keypoint_segmentation(*triple, config.support, config.support_mean)
+            for triple in triples
         ),
         "seg": seg,
     }
