@@ -75,6 +75,7 @@ def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
     assert_close(found.camera_T_part, wanted.camera_T_part)
     one = load(tmp_path).predict(points[0].double().numpy())
     assert_close(one.part_weight, wanted.part_weight[0])
+    assert found.confidence is not None
     assert_close(one.confidence, found.confidence[0])
     few = load(tmp_path).predict(points[:, :40])
     assert few.part_weight.shape == (2, 40, 2)
