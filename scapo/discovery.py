@@ -17,7 +17,6 @@ from torch import Tensor
 from scapo.axis_search import along_main_directions
 from scapo.joint_fit import FitOptions, fit
 from scapo.method import evenly
-from scapo.mirror import mirrored, thinned
 from scapo.part_evidence import rebuild
 from scapo.pose_search import Finalists, Found, SearchSpace, search
 from scapo.registration import rotation_grid
@@ -67,37 +66,27 @@ def improve(
 
 
 def search_all(
-    template: ArticulatedTemplate,
-    views: Views,
-    trusted: Trusted,
-    config: DiscoveryConfig,
-    *,
-    anywhere: bool = False,
+    template: ArticulatedTemplate, views: Views, trusted: Trusted, config: DiscoveryConfig
 ) -> Finalists:
-    """Every view over rotations and states, cameras near those of trusted views or anywhere."""
+    """Every view over rotations and states, near the cameras that trusted views have."""
     joints, sliding = len(template.kinds), "prismatic" in template.kinds
     known = range_of(trusted.placement.state, template.kinds)
     space = SearchSpace(
         states=known.wider(0.1 if sliding else 0.3).grid(7 if joints == 1 else 4),
         rotations=rotation_grid(config.rotations),
-        cameras=None if anywhere else trusted.cameras(),
+        cameras=trusted.cameras(),
     )
     return search(template, views, space)
 
 
 def unexplained(
-    template: ArticulatedTemplate,
-    trusted: Trusted,
-    views: Views,
-    config: DiscoveryConfig,
-    *,
-    anywhere: bool = False,
+    template: ArticulatedTemplate, trusted: Trusted, views: Views, config: DiscoveryConfig
 ) -> float:
     """Mean loss of views within their narrowest range of states, plus what that range costs.
 
     The range counts because a joint along a wrong axis explains almost as much with more of it.
     """
-    finalists = search_all(template, views, trusted, config, anywhere=anywhere)
+    finalists = search_all(template, views, trusted, config)
     states = narrowest(finalists.placement, finalists.loss, template.kinds, config.range_cost)
     return float(finalists.best(states).loss.mean()) + config.range_cost * states.extent()
 
@@ -126,40 +115,15 @@ def advance(
     share: float,
     config: DiscoveryConfig,
     generator: torch.Generator,
-    *,
-    anywhere: bool = False,
 ) -> Start:
     """One round: search all views, and fit the template to the share that is trusted most."""
     template, trusted = start
-    finalists = search_all(template, searched, trusted, config, anywhere=anywhere)
+    finalists = search_all(template, searched, trusted, config)
     states = narrowest(finalists.placement, finalists.loss, template.kinds, config.range_cost)
     found = finalists.best(states)
     kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
     trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
     return template, improve(template, trusted, config, generator)
-
-
-def completed(
-    start: Start,
-    held: Views,
-    searched: Views,
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> Start:
-    """The start with the mirror image of its base if that explains the held-out views better.
-
-    Views of the side that was missing were turned until they looked like others, so cameras are
-    sought anywhere, also in the round that follows.
-    """
-    template, trusted = start
-    tried = [template, *(mirrored(template, axis) for axis in range(3))]
-    losses = [unexplained(one, trusted, held, config, anywhere=True) for one in tried]
-    best = min(range(len(tried)), key=losses.__getitem__)
-    logger.info("mirror images judged: %s; kept: %d", " ".join(f"{x:.3f}" for x in losses), best)
-    if best == 0:
-        return start
-    start = thinned(tried[best], config.template_points), trusted
-    return advance(start, searched, config.trusted[0], config, generator, anywhere=True)
 
 
 def discover(
@@ -179,8 +143,6 @@ def discover(
         tried = [advance(start, half, share, config, generator) for start in tried]
     best = leaders(tried, judges, 1, config)[0]
     searched = others.take(evenly(total, config.searched))
-    if config.mirror:
-        best = completed(best, judges, searched, config, generator)
     for share in config.trusted:
         best = advance(best, searched, share, config, generator)
         logger.info(

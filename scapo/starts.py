@@ -60,8 +60,6 @@ class DiscoveryConfig:
     free to turn); 0: none."""
     held_frame: bool = True
     """Turn the template's frame to the main directions of its base in every round."""
-    mirror: bool = True
-    """Add the mirror image of the base where that explains the held-out views better."""
     way_out: bool = True
     """Take for a sliding joint's axis the way out of the body."""
     template_points: int = 400
