@@ -20,10 +20,15 @@ from torch import Tensor
 
 from scapo.geometry import project_rotation
 from scapo.part_evidence import gather_evidence, spread
-from scapo.registration import HIDDEN_COST, NORMAL_WEIGHT, NearestGrid
+from scapo.registration import HIDDEN_COST, NORMAL_WEIGHT, NearestGrid, rotation_grid
 from scapo.sightings import Views, free_and_hidden
 from scapo.template import ArticulatedTemplate, PartPoses, Placement
 from scapo.types import JointKind
+
+TOLD = 0.1
+"""Share of the base's normals that a direction needs to be one of its main ones."""
+NEAR = 0.9
+"""Cosine of normals that count for it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,13 +86,21 @@ def along_main_directions(template: ArticulatedTemplate, placement: Placement) -
     While shape, axes and all placements are fitted together nothing holds the frame: the whole
     template can turn in it. What is said of directions (axes along the main ones, scales along the
     frame's) then means something else in every round. Scales keep their numbers along the new
-    axes: with unequal ones the placed template changes a little.
+    axes: with unequal ones the placed template changes a little. A flat base tells one direction
+    only; about it the frame follows the first joint's axis.
 
     Returns:
         The placements of the turned template.
     """
     base = template.logit.argmax(-1) == 0
-    frame = _settled(template.normals[base], torch.eye(3).to(template.normals))
+    normals = template.normals[base]
+    frame = _settled(normals, torch.eye(3).to(normals))
+    told = _support(normals, frame)
+    if told.max() < 2 * TOLD:  # far from all of them: sought anew
+        frame = principal_frame(normals, rotation_grid(1500).to(normals))
+        told = _support(normals, frame)
+    if told.sort().values[1] < TOLD:
+        frame = _turned_to(frame, int(told.argmax()), template.directions()[0])
     for vectors in (template.points, template.normals, template.axis, template.pivot):
         vectors.copy_(vectors @ frame.T)
     return replace(
@@ -105,6 +118,30 @@ def _settled(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Floa
         rows = torch.stack([(normals * weight)[axis == c].sum(0) for c in range(3)])
         frame = project_rotation(F.normalize(rows, dim=-1))
     return frame
+
+
+def _support(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+    """Share of the normals near each direction, either sign."""
+    near = (normals @ frame.T).abs() > NEAR
+    return near.float().sum(0) / max(len(normals), 1)
+
+
+def _turned_to(
+    frame: Float[Tensor, "3 3"], held: int, axis: Float[Tensor, " 3"]
+) -> Float[Tensor, "3 3"]:
+    """The frame turned about its direction `held` until another one lies along the axis."""
+    across = axis - (axis @ frame[held]) * frame[held]
+    if across.norm() < 0.3:  # the axis is the held direction: nothing tells the others
+        return frame
+    across = F.normalize(across, dim=0)
+    along = frame @ across
+    along[held] = 0
+    first = int(along.abs().argmax())
+    rows = frame.clone()
+    rows[first] = across * along[first].sign()
+    last = 3 - held - first
+    rows[last] = torch.linalg.cross(rows[(last + 1) % 3], rows[(last + 2) % 3])
+    return rows
 
 
 def _amounts(kind: JointKind) -> Float[Tensor, " D"]:

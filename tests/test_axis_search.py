@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import roma
 import torch
 from sighted import AXIS, PIVOT, sighted, template
@@ -20,7 +21,7 @@ from scapo.axis_search import (
 )
 from scapo.geometry import point_line_distance, random_rotations
 from scapo.registration import rotation_grid
-from scapo.template import Placement
+from scapo.template import ArticulatedTemplate, Placement
 
 
 def posed(count: int, seed: int) -> Posed:
@@ -73,3 +74,28 @@ def test_the_frame_turns_back_to_the_main_directions_of_the_base():
     assert_close(found.rotation, start.rotation, atol=2e-3, rtol=0)
     assert_close(shape.directions()[0], AXIS, atol=2e-3, rtol=0)
     assert_close(shape.place(found)[0], before, atol=1e-4, rtol=0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("degrees", [30.0, 45.0])
+def test_the_frame_of_a_plate_follows_its_normal_and_its_hinge(degrees: float):
+    g = generator(7)
+    points = torch.rand(300, 3, generator=g) * torch.tensor([0.6, 0.4, 0.0])
+    up = (torch.rand(300, 1, generator=g) < 0.5) * 2.0 - 1
+    normals = up * torch.tensor([0.0, 0.0, 1.0]) + 0.05 * torch.randn(300, 3, generator=g)
+    plate = ArticulatedTemplate(("revolute",), 300)
+    plate.assign(
+        points,
+        torch.nn.functional.normalize(normals, dim=-1),
+        torch.tensor([[8.0, 0.0]]).expand(300, 2),
+    )
+    plate.axis.copy_(torch.tensor([[0.8, 0.6, 0.0]]))
+    turn = roma.rotvec_to_rotmat(torch.deg2rad(torch.tensor([degrees, 0.0, 0.0])))
+    for vectors in (plate.points, plate.normals, plate.axis):
+        vectors.copy_(vectors @ turn.T)
+    start = Placement.at(random_rotations(2, g), torch.zeros(2, 3), torch.zeros(2, 1))
+    before, _ = plate.place(start)
+    found = along_main_directions(plate, start)
+    assert plate.normals.abs().mean(0).max() > 0.98
+    assert plate.directions()[0].abs().max() > 0.999
+    assert_close(plate.place(found)[0], before, atol=1e-4, rtol=0)
