@@ -70,7 +70,7 @@ def changes(
 ) -> list[str]:
     """Options of a configuration that differ from the default, as words of a variant's name.
 
-    Sizes and counts (whole numbers, tuples of them) make no other variant.
+    Sizes, counts and schedules (whole numbers, tuples of numbers) make no other variant.
 
     Args:
         config: A dataclass, of dataclasses perhaps.
@@ -96,8 +96,9 @@ def changes(
 
 
 def _counts(value: object) -> bool:
-    many = value if isinstance(value, tuple) else (value,)
-    return all(isinstance(one, int) and not isinstance(one, bool) for one in many)
+    if isinstance(value, tuple):
+        return all(isinstance(one, int | float) for one in value)
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 class AbstractMethod(nn.Module, ABC):
