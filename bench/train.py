@@ -22,7 +22,7 @@ from scapo.checkpoint import WEIGHTS
 from scapo.precision import Arithmetic, Precision
 from scapo.ranks import joined, own_device
 from scapo.resident import read_training_data
-from scapo.run_folder import kept
+from scapo.run_folder import TIMING, kept
 from scapo.store import open_split
 
 M = TypeVar("M")
@@ -70,7 +70,7 @@ class Train(Generic[M]):
                 try:
                     self._fit(device, console if ranks.first else Console(quiet=True))
                 finally:  # a run that stops early has its page too
-                    if ranks.first and (self.out / WEIGHTS).is_file():
+                    if ranks.first and (self.out / TIMING).is_file():
                         write_report(self.out)
         except KeyboardInterrupt as stop:
             raise KeyboardInterrupt(f"{self.out}: interrupted; {kept(self.out)}") from stop

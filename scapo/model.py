@@ -136,7 +136,7 @@ class Scapo(AbstractMethod):
         config = self.config
         preset = ScapoConfig() if config.preset == "paper" else cpu_config()
         words = [] if config.preset == "paper" else [config.preset]
-        words += ["".join(sorted(label[0].upper() for label in config.supervision))[::-1]]
+        words += ["".join(sorted((label[0].upper() for label in config.supervision), reverse=True))]
         words += changes(config, preset, leave=UNNAMED)
         words += [f"wo_{term}" for term in config.loss.without]
         return "-".join(word for word in words if word)
