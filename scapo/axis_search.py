@@ -25,8 +25,10 @@ from scapo.sightings import Views, free_and_hidden
 from scapo.template import ArticulatedTemplate, PartPoses, Placement
 from scapo.types import JointKind
 
-TOLD = 0.1
+TOLD = 0.05
 """Share of the base's normals that a direction needs to be one of its main ones."""
+LOST = 0.2
+"""Where no direction of a frame has this share, the frame is sought anew."""
 NEAR = 0.9
 """Cosine of normals that count for it."""
 
@@ -96,7 +98,7 @@ def along_main_directions(template: ArticulatedTemplate, placement: Placement) -
     normals = template.normals[base]
     frame = _settled(normals, torch.eye(3).to(normals))
     told = _support(normals, frame)
-    if told.max() < 2 * TOLD:  # far from all of them: sought anew
+    if told.max() < LOST:
         frame = principal_frame(normals, rotation_grid(1500).to(normals))
         told = _support(normals, frame)
     if told.sort().values[1] < TOLD:
@@ -106,6 +108,17 @@ def along_main_directions(template: ArticulatedTemplate, placement: Placement) -
     return replace(
         placement, rotation=placement.rotation @ frame.T, shift=placement.shift @ frame.T
     )
+
+
+@torch.no_grad()
+def tells_frame(template: ArticulatedTemplate) -> bool:
+    """Whether the normals of the base follow two directions of the template's frame at least.
+
+    Those of a plate follow one. About it the frame follows the hinge, so a pull of the hinge to
+    the frame would hold it wherever it began.
+    """
+    normals = template.normals[template.logit.argmax(-1) == 0]
+    return bool(_support(normals, torch.eye(3).to(normals)).sort().values[1] >= TOLD)
 
 
 def _settled(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:

@@ -14,9 +14,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from scapo.axis_search import along_main_directions
+from scapo.axis_search import along_main_directions, tells_frame
 from scapo.joint_fit import FitOptions, fit
 from scapo.method import evenly
+from scapo.mirror import mirrored
 from scapo.part_evidence import rebuild
 from scapo.pose_search import Finalists, Found, SearchSpace, search
 from scapo.registration import rotation_grid
@@ -55,26 +56,48 @@ def improve(
             around = range_of(placement.state, template.kinds)
             states = around.wider(0.0 if sliding else 0.25).grid(11)
         search_at = (0,) if sliding or number < rounds // 2 else ()
-        options = FitOptions(
-            steps=25,
-            sharpness=(150.0, 400.0),
-            search_states=search_at,
-            axis_weight=config.axis_weight,
-        )
+        options = _late(template, config, search_at)
         placement, _ = fit(template, views, placement, options, states=states, generator=generator)
     return Trusted(views=views, placement=placement)
 
 
+def detailed(start: Start, config: DiscoveryConfig, generator: torch.Generator) -> Start:
+    """The start with a template of `final_points`, built and fitted to the same views."""
+    template, trusted = start
+    dense = template.with_points(config.final_points)
+    rebuild(dense, trusted.views, trusted.placement, generator=generator)
+    options = _late(dense, config)
+    placement, _ = fit(dense, trusted.views, trusted.placement, options, generator=generator)
+    return dense, Trusted(views=trusted.views, placement=placement)
+
+
+def _late(
+    template: ArticulatedTemplate, config: DiscoveryConfig, search_states: tuple[int, ...] = ()
+) -> FitOptions:
+    """A fit to trusted views; axes are pulled to the template's frame where its base tells it."""
+    return FitOptions(
+        steps=25,
+        sharpness=(150.0, 400.0),
+        search_states=search_states,
+        axis_weight=config.axis_weight if tells_frame(template) else 0.0,
+    )
+
+
 def search_all(
-    template: ArticulatedTemplate, views: Views, trusted: Trusted, config: DiscoveryConfig
+    template: ArticulatedTemplate,
+    views: Views,
+    trusted: Trusted,
+    config: DiscoveryConfig,
+    *,
+    anywhere: bool = False,
 ) -> Finalists:
-    """Every view over rotations and states, near the cameras that trusted views have."""
+    """Every view over rotations and states, cameras near those of trusted views or anywhere."""
     joints, sliding = len(template.kinds), "prismatic" in template.kinds
     known = range_of(trusted.placement.state, template.kinds)
     space = SearchSpace(
         states=known.wider(0.1 if sliding else 0.3).grid(7 if joints == 1 else 4),
         rotations=rotation_grid(config.rotations),
-        cameras=trusted.cameras(),
+        cameras=None if anywhere else trusted.cameras(),
     )
     return search(template, views, space)
 
@@ -115,15 +138,45 @@ def advance(
     share: float,
     config: DiscoveryConfig,
     generator: torch.Generator,
+    *,
+    anywhere: bool = False,
 ) -> Start:
     """One round: search all views, and fit the template to the share that is trusted most."""
     template, trusted = start
-    finalists = search_all(template, searched, trusted, config)
+    finalists = search_all(template, searched, trusted, config, anywhere=anywhere)
     states = narrowest(finalists.placement, finalists.loss, template.kinds, config.range_cost)
     found = finalists.best(states)
     kept = trust_order(found)[: max(8, round(share * len(searched.points)))]
     trusted = Trusted(views=searched.take(kept), placement=found.placement.take(kept))
     return template, improve(template, trusted, config, generator)
+
+
+def completed(
+    start: Start,
+    judges: Views,
+    searched: Views,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> Start:
+    """One round of the start as it is, and with a mirror image of its base along each direction.
+
+    That goes on which explains the held-out views best. Mirror images are judged after they were
+    rebuilt from views, which leaves out what no view saw, and all with dense templates: of two
+    sparse ones that with more surface is the coarser, which costs more than a side that is missing.
+    Views of such a side were turned until they looked like others: for their round cameras are
+    sought anywhere.
+    """
+    template, trusted = start
+    share = config.trusted[0]
+    wholes = [(mirrored(template, axis), trusted) for axis in range(3)]
+    tried = [
+        advance(start, searched, share, config, generator),
+        *(advance(whole, searched, share, config, generator, anywhere=True) for whole in wholes),
+    ]
+    losses = [unexplained(*detailed(one, config, generator), judges, config) for one in tried]
+    best = min(range(len(tried)), key=losses.__getitem__)
+    logger.info("mirror images judged: %s; kept: %d", " ".join(f"{x:.3f}" for x in losses), best)
+    return tried[best]
 
 
 def discover(
@@ -143,11 +196,14 @@ def discover(
         tried = [advance(start, half, share, config, generator) for start in tried]
     best = leaders(tried, judges, 1, config)[0]
     searched = others.take(evenly(total, config.searched))
-    for share in config.trusted:
+    shares = config.trusted
+    if config.mirror and shares:
+        best, shares = completed(best, judges, searched, config, generator), shares[1:]
+    for share in shares:
         best = advance(best, searched, share, config, generator)
         logger.info(
             "round on the most trusted %d of %d views",
             len(best[1].views.points),
             len(searched.points),
         )
-    return best
+    return detailed(best, config, generator)

@@ -10,11 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.geometry import rigid
-from scapo.joint_fit import oriented_nearest
-from scapo.points import Similarity
+from scapo.joint_fit import NORMAL_LENGTH
+from scapo.points import Similarity, k_nearest
 from scapo.sightings import surface_normals
 from scapo.template import ArticulatedTemplate, Placement, slides
 from scapo.types import Joints, Prediction
+
+NEIGHBOURS = 12
+"""Template points that tell the part of an observed one."""
+REACH = 0.04
+"""Of their weights, normalised length; a unit of normal difference counts as `NORMAL_LENGTH`."""
 
 
 @torch.no_grad()
@@ -68,7 +73,26 @@ def nearest_weights(
     placement: Placement,
     camera: Float[Tensor, "B 3"],
 ) -> Float[Tensor, "B N P"]:
-    """Part weights of the placed template's point that is nearest in position and normal."""
+    """Part weights of the placed template's points that are nearest in position and normal."""
     normals = surface_normals(points, points, camera)
-    index = oriented_nearest(points, normals, *template.place(placement))
-    return template.logit.softmax(-1)[index]
+    placed, placed_normals = template.place(placement)
+    source = torch.cat([points, NORMAL_LENGTH * normals], -1)
+    target = torch.cat([placed, NORMAL_LENGTH * placed_normals], -1)
+    weight = template.logit.softmax(-1)
+    return torch.stack(
+        [smoothed(one, other, weight) for one, other in zip(source, target, strict=True)]
+    )
+
+
+def smoothed(
+    source: Float[Tensor, "N D"], target: Float[Tensor, "M D"], values: Float[Tensor, "M P"]
+) -> Float[Tensor, "N P"]:
+    """Mean of the values at the nearest targets, a Gaussian of `REACH` beyond the nearest.
+
+    The labels of single template points are noisy where two parts meet.
+    """
+    index = k_nearest(source, target, min(NEIGHBOURS, len(target)))
+    off = (source[:, None] - target[index]).square().sum(-1)
+    share = torch.exp((off[:, :1] - off) / (2 * REACH**2))
+    share = share / share.sum(-1, keepdim=True)
+    return (share[..., None] * values[index]).sum(1)

@@ -33,9 +33,11 @@ def nearest(
 
 @torch.no_grad()
 def k_nearest(
-    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"], k: int
+    source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"], k: int
 ) -> Int[Tensor, "*B N {k}"]:
     """Indices into `target` of the k nearest neighbours of each source point, nearest first.
+
+    Points of space, or features of any dimension D.
 
     Raises:
         ValueError: `target` has fewer than k points.
@@ -45,7 +47,7 @@ def k_nearest(
 
 @uncompiled  # blocks, numpy and exact arithmetic are no matter for a compiler
 def _search(
-    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"], k: int
+    source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"], k: int
 ) -> Int[Tensor, "*B N {k}"]:
     """The k smallest scores |t|^2 - 2 s.t of each row, a block of the score matrix at a time.
 
@@ -60,10 +62,11 @@ def _search(
     centre = target.to(dtype).mean(-2, keepdim=True)
     source, target = source.to(dtype) - centre, target.to(dtype) - centre
     left = torch.cat([source, torch.ones_like(source[..., :1])], -1)
+    wide = left.shape[-1]
     right = torch.cat([-2 * target, target.square().sum(-1, keepdim=True)], -1).mT
     found = [
         _smallest(scores) if k == 1 else scores.topk(k, largest=False).indices
-        for scores in _products(left.reshape(clouds, n, 4), right.reshape(clouds, 4, m))
+        for scores in _products(left.reshape(clouds, n, wide), right.reshape(clouds, wide, m))
     ]
     rows = [index.reshape(-1, k) for index in found]
     empty = torch.zeros(0, k, dtype=torch.long, device=source.device)
@@ -75,7 +78,7 @@ BLOCK = 1 << 19
 
 
 def _products(
-    left: Float[Tensor, "B N 4"], right: Float[Tensor, "B 4 M"]
+    left: Float[Tensor, "B N D"], right: Float[Tensor, "B D M"]
 ) -> Iterator[Float[Tensor, "_ _ M"]]:
     """The product left @ right, in order, as many clouds, or rows of one, at a time as fit."""
     n, m = left.shape[1], right.shape[2]
@@ -89,7 +92,7 @@ def _products(
 
 
 def _numpy_product(
-    left: Float[Tensor, "B N 4"], right: Float[Tensor, "B 4 M"]
+    left: Float[Tensor, "B N D"], right: Float[Tensor, "B D M"]
 ) -> Float[Tensor, "B N M"]:
     """The same by numpy, whose OpenBLAS takes a sixth of MKL's time for matrices this thin."""
     return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))

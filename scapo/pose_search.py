@@ -23,7 +23,9 @@ from scapo.state_range import StateRange
 from scapo.template import ArticulatedTemplate, Placement
 
 CHUNK = 256
-"""Hypotheses refined at once."""
+"""Hypotheses refined at once, with templates of up to `LIGHT` points."""
+LIGHT = 400
+"""Points of the template that the search uses until its last steps."""
 VIEWS = 64
 """Views searched at once: each has `SearchSpace.keep` hypotheses."""
 
@@ -99,7 +101,7 @@ def coarse_cost(
 @torch.no_grad()
 def propose(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Placement:
     """The `space.keep` best distinct placements of each view on the grid, view by view."""
-    states = state_grid(space.states)
+    states, template = state_grid(space.states), _light(template)
     turn = torch.eye(3).to(states).expand(len(states), 3, 3)
     posed = template.place(Placement.at(turn, states.new_zeros(len(states), 3), states))
     grid = NearestGrid.build(*posed)
@@ -133,7 +135,8 @@ def refine(
     """
     options = options or StepOptions()
     placements, losses = [], []
-    for index in torch.arange(len(views.points), device=views.points.device).split(CHUNK):
+    chunk = max(1, CHUNK * LIGHT // max(LIGHT, len(template.points)))
+    for index in torch.arange(len(views.points), device=views.points.device).split(chunk):
         part = views.take(index)
         placement = settle(template, part, start.take(index), options)
         total = part.points.shape[1]
@@ -213,8 +216,15 @@ ROUNDS = (
     (StepOptions(steps=5, points=96), 6),
 )
 """Of `tournament`: steps, and how many distinct hypotheses of a view go on."""
-LAST = (StepOptions(steps=10, points=128), StepOptions(steps=4, points=256))
-"""Steps of those that are left, with all points at the end: what ranks them should be sharp."""
+LONG = StepOptions(steps=10, points=128)
+"""Steps of those that are left."""
+LAST = StepOptions(steps=4, points=256)
+"""Their last, with all points of cloud and template: what ranks them should be sharp."""
+
+
+def _light(template: ArticulatedTemplate) -> ArticulatedTemplate:
+    """The template as the search uses it until its last steps."""
+    return template.with_points(LIGHT) if len(template.points) > LIGHT else template
 
 
 def tournament(
@@ -226,19 +236,18 @@ def tournament(
     hypotheses are seldom the best before refinement, and few steps tell the hopeless ones. Those
     that are left before the last steps try all `states` again.
     """
-    count = len(views.points)
+    count, light = len(views.points), _light(template)
     first = torch.arange(count, device=views.points.device)
     placement = start
     for options, left in ROUNDS:
         number = len(placement.state) // count
         index = first.repeat_interleave(number)
-        placement, loss = refine(template, views.take(index), placement, options)
+        placement, loss = refine(light, views.take(index), placement, options)
         table = placement.rotation.unflatten(0, (count, number))
         best = distinct(table, loss.view(count, number), min(left, number), 12.0)
         placement = placement.take((best + first[:, None] * number).flatten())
     repeated = views.take(first.repeat_interleave(len(placement.state) // count))
-    placement = _states_again(template, repeated, placement, states)
-    loss = views.points.new_zeros(len(placement.state))
-    for options in LAST:
-        placement, loss = refine(template, repeated, placement, options)
+    placement = _states_again(light, repeated, placement, states)
+    placement, _ = refine(light, repeated, placement, LONG)
+    placement, loss = refine(template, repeated, placement, LAST)
     return Finalists(placement=placement, loss=loss.view(count, -1))

@@ -69,7 +69,7 @@ class RegisteredScapo(AbstractMethod):
         super().__init__()
         self.config, self.category = config, category
         kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
-        self.template = ArticulatedTemplate(kinds, config.discovery.template_points)
+        self.template = ArticulatedTemplate(kinds, config.discovery.final_points)
         self.network = PointVotes(len(category.parts), len(kinds), width=config.width)
         for layer in self.network.modules():
             if isinstance(layer, nn.Linear):

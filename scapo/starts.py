@@ -56,13 +56,18 @@ class DiscoveryConfig:
     range_cost: float = RANGE_COST
     """Mean loss that a radian of range may save; 0: any range of states."""
     axis_weight: float = 1.0
-    """Pull of the axes to the main directions once a start is chosen (before, wrong axes must be
-    free to turn); 0: none."""
+    """Pull of the axes to the main directions of the base once a start is chosen (before, wrong
+    axes must be free to turn) and where the base has two of them; 0: none."""
     held_frame: bool = True
     """Turn the template's frame to the main directions of its base in every round."""
     way_out: bool = True
     """Take for a sliding joint's axis the way out of the body."""
+    mirror: bool = True
+    """Try whether the base lacks a side that is the mirror image of another."""
     template_points: int = 400
+    """While the template is sought."""
+    final_points: int = 1600
+    """Of the template that is found; borders between its parts are as sharp as it is dense."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for a grid too coarse to rank its rotations."""

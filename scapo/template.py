@@ -108,6 +108,19 @@ class ArticulatedTemplate(nn.Module):
         self.normals.copy_(normals[index])
         self.logit.copy_(logit[index])
 
+    @torch.no_grad()
+    def with_points(self, count: int) -> ArticulatedTemplate:
+        """Another with the same joints and so many points.
+
+        They are the first of this one's, which `part_evidence.rebuild` leaves spread out; where
+        there are fewer, all of them, repeated.
+        """
+        made = ArticulatedTemplate(self.kinds, count).to(self.points)
+        made.assign(self.points[:count], self.normals[:count], self.logit[:count])
+        made.axis.copy_(self.axis)
+        made.pivot.copy_(self.pivot)
+        return made
+
     def directions(self) -> Float[Tensor, "J 3"]:
         """Unit axes."""
         return F.normalize(self.axis, dim=-1)

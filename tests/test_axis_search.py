@@ -18,6 +18,7 @@ from scapo.axis_search import (
     principal_frame,
     search_joint,
     still_evidence,
+    tells_frame,
 )
 from scapo.geometry import point_line_distance, random_rotations
 from scapo.registration import rotation_grid
@@ -71,6 +72,7 @@ def test_the_frame_turns_back_to_the_main_directions_of_the_base():
         vectors.copy_(vectors @ lean.T)
     leant = replace(start, rotation=start.rotation @ lean.T)
     found = along_main_directions(shape, leant)
+    assert tells_frame(shape)
     assert_close(found.rotation, start.rotation, atol=2e-3, rtol=0)
     assert_close(shape.directions()[0], AXIS, atol=2e-3, rtol=0)
     assert_close(shape.place(found)[0], before, atol=1e-4, rtol=0)
@@ -96,6 +98,7 @@ def test_the_frame_of_a_plate_follows_its_normal_and_its_hinge(degrees: float):
     start = Placement.at(random_rotations(2, g), torch.zeros(2, 3), torch.zeros(2, 1))
     before, _ = plate.place(start)
     found = along_main_directions(plate, start)
+    assert not tells_frame(plate)
     assert plate.normals.abs().mean(0).max() > 0.98
     assert plate.directions()[0].abs().max() > 0.999
     assert_close(plate.place(found)[0], before, atol=1e-4, rtol=0)

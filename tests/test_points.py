@@ -231,3 +231,9 @@ def test_neighbours_and_distances_on_a_gpu_are_those_of_the_cpu() -> None:
         assert torch.equal(cloud.k_nearest(*on_gpu, 5).cpu(), cloud.k_nearest(a, b, 5))
     assert_close(cloud.chamfer(*on_gpu).cpu(), cloud.chamfer(a, b))
     assert torch.equal(cloud.farthest_points(on_gpu[0], 9).cpu(), cloud.farthest_points(a, 9))
+
+
+def test_k_nearest_of_features():
+    source, target = torch.randn(2, 70, 6, generator=torch.Generator().manual_seed(4)).split((30, 40), 1)
+    index = cloud.k_nearest(source, target, 3)
+    assert torch.equal(index, torch.cdist(source, target).topk(3, largest=False).indices)

@@ -74,3 +74,11 @@ def test_a_turned_placement_turns_the_points():
     turn = random_rotations(4, generator(9))
     points, _ = template.place(turn_placement(placement, turn))
     assert_close(points, template.place(placement)[0] @ turn.mT, atol=1e-4, rtol=1e-4)
+
+
+def test_a_lighter_template_has_the_first_points_and_the_same_joints():
+    template, placement = drawn("revolute")
+    light, repeated = template.with_points(8), template.with_points(50)
+    assert_close(light.place(placement)[0], template.place(placement)[0][:, :8])
+    assert_close(light.joints_in_view(placement), template.joints_in_view(placement))
+    assert torch.equal(repeated.points[20:40], template.points)

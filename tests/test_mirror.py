@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+"""A side of the body that is missing is there again in its mirror image; parts stay alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from sighted import sighted, template
+from strategies import generator
+
+from scapo.discovery import completed, detailed, unexplained
+from scapo.mirror import mirrored
+from scapo.starts import DiscoveryConfig, Trusted
+from scapo.template import ArticulatedTemplate
+
+
+def without_a_side() -> ArticulatedTemplate:
+    """The box with its flap, but without its side at positive y."""
+    whole = template(count=500)
+    kept = (whole.normals[:, 1] < 0.8) | (whole.logit.argmax(-1) == 1)
+    cut = whole.with_points(400)
+    cut.assign(whole.points[kept][:400], whole.normals[kept][:400], whole.logit[kept][:400])
+    return cut
+
+
+def test_the_base_is_mirrored_and_the_part_is_not() -> None:
+    cut = without_a_side()
+    part, none = cut.logit.argmax(-1), cut.normals[:, 1] > 0.8
+    assert not (none & (part == 0)).any()
+    whole = mirrored(cut, 1)
+    assert len(whole.points) == len(cut.points)
+    base = whole.logit.argmax(-1) == 0
+    right = base & (whole.normals[:, 1] > 0.8)
+    left = base & (whole.normals[:, 1] < -0.8)
+    assert right.sum() > 0.6 * left.sum() > 10
+    middle = (whole.points[right, 1].mean() + whole.points[left, 1].mean()) / 2
+    assert middle.abs() < 0.02
+    flap, before = whole.points[~base], cut.points[part == 1]
+    assert (flap[:, None] - before).norm(dim=-1).amin(1).max() < 1e-6
+    assert torch.equal(whole.axis, cut.axis)
+    assert torch.equal(whole.pivot, cut.pivot)
+
+
+@pytest.mark.slow
+def test_a_missing_side_is_completed_where_views_ask_for_it() -> None:
+    views, truth = sighted(16, seed=90)
+    trusted, config = Trusted(views=views, placement=truth), DiscoveryConfig(rotations=300)
+    cut = without_a_side()
+    before = unexplained(*detailed((cut, trusted), config, generator(0)), views, config)
+    found, after = completed((cut, trusted), views, views, config, generator(0))
+    sideways = found.normals[found.logit.argmax(-1) == 0][:, 1]
+    assert (sideways > 0.8).sum() > 10
+    assert (sideways < -0.8).sum() > 10
+    dense = detailed((found, after), config, generator(0))
+    assert len(dense[0].points) == config.final_points
+    assert unexplained(*dense, views, config) < before + 0.02
