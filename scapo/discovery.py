@@ -64,10 +64,12 @@ def improve(
 def detailed(start: Start, config: DiscoveryConfig, generator: torch.Generator) -> Start:
     """The start with a template of `final_points`, built and fitted to the same views."""
     template, trusted = start
-    dense = template.with_points(config.final_points)
-    rebuild(dense, trusted.views, trusted.placement, generator=generator)
+    dense, placement = template.with_points(config.final_points), trusted.placement
+    rebuild(dense, trusted.views, placement, generator=generator)
+    if config.way_out:
+        placement = choose_axes(dense, placement, torch.eye(3))
     options = _late(dense, config)
-    placement, _ = fit(dense, trusted.views, trusted.placement, options, generator=generator)
+    placement, _ = fit(dense, trusted.views, placement, options, generator=generator)
     return dense, Trusted(views=trusted.views, placement=placement)
 
 
@@ -198,7 +200,7 @@ def discover(
     searched = others.take(evenly(total, config.searched))
     shares = config.trusted
     if config.mirror and shares:
-        best, shares = completed(best, judges, searched, config, generator), shares[1:]
+        best, shares = completed(best, judges, half, config, generator), shares[1:]
     for share in shares:
         best = advance(best, searched, share, config, generator)
         logger.info(

@@ -234,6 +234,8 @@ def test_neighbours_and_distances_on_a_gpu_are_those_of_the_cpu() -> None:
 
 
 def test_k_nearest_of_features():
-    source, target = torch.randn(2, 70, 6, generator=torch.Generator().manual_seed(4)).split((30, 40), 1)
+    source, target = torch.randn(2, 70, 6, generator=torch.Generator().manual_seed(4)).split(
+        (30, 40), 1
+    )
     index = cloud.k_nearest(source, target, 3)
     assert torch.equal(index, torch.cdist(source, target).topk(3, largest=False).indices)

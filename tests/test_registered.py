@@ -16,6 +16,7 @@ from scapo.method import Step
 from scapo.points import squared_distances
 from scapo.registered import RegisteredScapo
 from scapo.registered_config import RegisteredConfig
+from scapo.starts import DiscoveryConfig
 from scapo.types import Labels, Observation, Prediction
 
 
@@ -23,7 +24,8 @@ def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
     """The method with the true template and placements of 12 clouds, its network taught a bit."""
     views, truth = sighted(12, seed=60)
     cloud = views.points - views.camera[:, None]  # the camera at the origin
-    config = RegisteredConfig(points=128, width=16, batch=12)
+    discovery = DiscoveryConfig(final_points=400)
+    config = RegisteredConfig(points=128, width=16, batch=12, discovery=discovery)
     method = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
     method.template.load_state_dict(template().state_dict())
     camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
