@@ -40,7 +40,8 @@ class DiscoveryConfig:
     searched: int = 144
     """Views of the rounds of search and fit, 0.2 s each and round."""
     trusted: tuple[float, ...] = (0.55, 0.7, 0.85)
-    """Share of the searched views that each round keeps."""
+    """Share of the searched views that each round keeps; the first is on half of the views where
+    mirror images are tried."""
     starts: int = 3
     """Candidate axes of each joint that are optimised; two of each where joints are several."""
     draws: int = 3
