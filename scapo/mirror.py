@@ -10,11 +10,8 @@ against the one without, after both went through a round (`discovery.completed`)
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from scapo.joint_fit import NORMAL_LENGTH
-from scapo.part_evidence import farthest_features
+from scapo.part_evidence import farthest_features, surface_features
 from scapo.template import ArticulatedTemplate
 
 
@@ -33,22 +30,10 @@ def mirrored(template: ArticulatedTemplate, axis: int) -> ArticulatedTemplate:
         ends = torch.tensor([0.02, 0.98]).to(points)
         points[:, axis] = points[:, axis].quantile(ends).sum() - points[:, axis]
         normals[:, axis] = -normals[:, axis]
-    return _thinned(
-        template,
-        torch.cat([template.points, points]),
-        torch.cat([template.normals, normals]),
-        torch.cat([template.logit, template.logit[base]]),
-    )
-
-
-def _thinned(
-    template: ArticulatedTemplate,
-    points: Float[Tensor, "C 3"],
-    normals: Float[Tensor, "C 3"],
-    logit: Float[Tensor, "C P"],
-) -> ArticulatedTemplate:
-    """The template with as many points as it has of these, spread over surface and parts."""
-    feature = torch.cat([points, NORMAL_LENGTH * normals, 0.1 * logit.softmax(-1)], -1)
+    points = torch.cat([template.points, points])
+    normals = torch.cat([template.normals, normals])
+    logit = torch.cat([template.logit, template.logit[base]])
+    feature = surface_features(points, normals, logit.softmax(-1))
     index = farthest_features(feature, len(template.points))
     made = template.with_points(len(index))
     made.assign(points[index], normals[index], logit[index])

@@ -146,13 +146,20 @@ def _resample(
         return
     points, normals, score, support = points[good], normals[good], score[good], support[good]
     part = F.one_hot(score.argmax(-1), score.shape[1]).to(points)
-    feature = torch.cat([points, 0.06 * normals, 0.1 * part], -1)
+    feature = surface_features(points, normals, part)
     index = farthest_features(feature, min(len(template.points), len(points)))
     off = torch.cdist(feature[index], feature).square()
     weight = torch.exp(-off / (2 * 0.03**2)) * support
     weight = weight / weight.sum(-1, keepdim=True)
     logit = 6 * weight @ score
     template.assign(weight @ points, F.normalize(weight @ normals, dim=-1), logit)
+
+
+def surface_features(
+    points: Float[Tensor, "C 3"], normals: Float[Tensor, "C 3"], part: Float[Tensor, "C P"]
+) -> Float[Tensor, "C D"]:
+    """Features whose distance tells points apart by place, normal (0.06) and part (0.1)."""
+    return torch.cat([points, 0.06 * normals, 0.1 * part], -1)
 
 
 def farthest_features(feature: Float[Tensor, "C D"], count: int) -> Int[Tensor, " {count}"]:

@@ -18,7 +18,7 @@ from torch import Tensor
 from scapo.axis_search import JointGuess, Posed, principal_frame, search_joint, still_evidence
 from scapo.consensus import agree
 from scapo.joint_fit import FitOptions, fit
-from scapo.part_evidence import farthest_features, rebuild
+from scapo.part_evidence import farthest_features, rebuild, surface_features
 from scapo.registration import register_pairs, rotation_grid
 from scapo.sightings import Views
 from scapo.sliding_gauge import choose_axes
@@ -151,7 +151,7 @@ def first_template(
     for j, rows in enumerate(moved):
         label[rows] = j + 1
     part = F.one_hot(label.flatten(), len(kinds) + 1).to(points)
-    index = farthest_features(torch.cat([points, 0.06 * normals, 0.1 * part], -1)[::2], count) * 2
+    index = farthest_features(surface_features(points, normals, part)[::2], count) * 2
     template = ArticulatedTemplate(kinds, count)
     template.assign(points[index], normals[index], 3 * part[index])
     with torch.no_grad():
