@@ -106,7 +106,10 @@ def along_main_directions(template: ArticulatedTemplate, placement: Placement) -
     for vectors in (template.points, template.normals, template.axis, template.pivot):
         vectors.copy_(vectors @ frame.T)
     return replace(
-        placement, rotation=placement.rotation @ frame.T, shift=placement.shift @ frame.T
+        placement,
+        rotation=placement.rotation @ frame.T,
+        shift=placement.shift @ frame.T,
+        lean=placement.lean @ frame.T,
     )
 
 

@@ -193,6 +193,7 @@ class _Free:
             log_scale=self.log_scale,
             state=self.state,
             shift=(self.shift - along) * self.slides,
+            lean=self.start.lean,
         )
 
 

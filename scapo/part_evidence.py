@@ -107,15 +107,25 @@ def rebuild(
     views: Views,
     placement: Placement,
     *,
+    poses: PartPoses | None = None,
     generator: torch.Generator,
     observers: int = 24,
 ) -> None:
-    """Build the template's points and part weights anew from all views at their placements."""
+    """Build the template's points and part weights anew from all views at their placements.
+
+    Args:
+        template: Changed in place.
+        views: B views.
+        placement: Theirs.
+        poses: Of the parts, if they are not as placed.
+        generator: Draws the observers.
+        observers: Views that are asked about the points of the others.
+    """
     count = max(40, min(views.points.shape[1], 6000 // len(views.points)))
     order = torch.randperm(len(views.points), generator=generator, device=generator.device)
     evidence = gather_evidence(
         views,
-        template.part_poses(placement),
+        template.part_poses(placement) if poses is None else poses,
         placement.log_scale,
         count=count,
         observers=order[:observers],

@@ -62,6 +62,7 @@ def canonical_points(template: ArticulatedTemplate, placement: Placement) -> Flo
         rotation=torch.eye(3).to(placement.rotation).expand_as(placement.rotation),
         translation=torch.zeros_like(placement.translation),
         state=torch.zeros_like(placement.state),
+        lean=torch.zeros_like(placement.lean),
     )
     return template.place(still)[0]
 

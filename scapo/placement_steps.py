@@ -96,7 +96,8 @@ def _joint_columns(
 ) -> tuple[Float[Tensor, "H M 3"], Float[Tensor, "H 1 3 3"]]:
     """What the state of joint j, and its place across the axis, move its part's points by."""
     turn, axis = placement.rotation, template.directions()[j]
-    way = (turn @ axis)[:, None].expand_as(points)
+    leaning = template.leaning(placement)[:, j, :, None]
+    way = (turn @ leaning)[..., 0][:, None].expand_as(points)
     across = torch.eye(3).to(axis) - axis[:, None] * axis
     shift = (turn @ across).mT[:, None]
     if template.kinds[j] == "prismatic":

@@ -60,9 +60,10 @@ class PseudoPlacements(nn.Module):
             setattr(self, name, value.detach().clone())
 
     def placement(self) -> Placement:
-        """All of them."""
+        """All of them, their hinges straight."""
         names = self.NAMES[1:6]
-        return Placement(**{name: getattr(self, name) for name in names})
+        values = {name: getattr(self, name) for name in names}
+        return Placement(**values, lean=torch.zeros_like(self.shift))
 
     def find(self, first: Float[Tensor, "B 3"]) -> Int[Tensor, " B"]:
         """Row of each cloud, by its first point.

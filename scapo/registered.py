@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from scapo.discovery import discover, search_all, trust_order
+from scapo.leans import settle_leans
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.pictures import PictureData
 from scapo.placed import nearest_weights, placed_prediction
@@ -201,6 +202,7 @@ class RegisteredScapo(AbstractMethod):
             log_scale=votes.log_scale,
             state=votes.state,
             shift=votes.shift * slides(self.template),
+            lean=torch.zeros_like(votes.shift),
         )
         return placement, (votes, weight.mean(1).view(count, 4))
 
@@ -268,6 +270,8 @@ class RegisteredScapo(AbstractMethod):
         final = found.placement
         if self.config.settle:
             final = settle_states(self.template, views, found, self._states())
+        if self.template.leans():
+            final, _ = settle_leans(self.template, views, final)
         return turn_placement(final, frame.mT), found.margin
 
     def _states(self) -> StateRange:

@@ -65,6 +65,8 @@ class DiscoveryConfig:
     """Take for a sliding joint's axis the way out of the body."""
     mirror: bool = True
     """Try whether the base lacks a side that is the mirror image of another."""
+    leans: bool = True
+    """Try whether hinges lean from one object to the next."""
     template_points: int = 400
     """While the template is sought."""
     final_points: int = 1600

@@ -32,6 +32,8 @@ class Placement:
     """Relative to the template's own state: rad or normalised length."""
     shift: Float[Tensor, "B J 3"]
     """Of a joint and its part on the base, template frame, after scaling."""
+    lean: Float[Tensor, "B J 3"]
+    """Turn of a hinge's axis from the category's (rotation vector, template frame)."""
 
     def take(self, index: Int[Tensor, " Q"]) -> Placement:
         """The placements of these indices."""
@@ -54,6 +56,7 @@ class Placement:
             log_scale=torch.zeros_like(translation),
             state=state,
             shift=translation.new_zeros(*state.shape, 3),
+            lean=translation.new_zeros(*state.shape, 3),
         )
 
     @staticmethod
@@ -70,6 +73,10 @@ class PartPoses:
     rotation: Float[Tensor, "B P 3 3"]
     translation: Float[Tensor, "B P 3"]
 
+    def take(self, index: Int[Tensor, " Q"]) -> PartPoses:
+        """The poses of these views."""
+        return PartPoses(rotation=self.rotation[index], translation=self.translation[index])
+
 
 class ArticulatedTemplate(nn.Module):
     """Oriented points with part weights, and the joints that move them."""
@@ -83,7 +90,13 @@ class ArticulatedTemplate(nn.Module):
     pivot: nn.Parameter
     """(J, 3)"""
     normals: Tensor
-    """(M, 3), a buffer."""
+    """(M, 3); a buffer, as what follows."""
+    rest: Tensor
+    """(J,) state at which a lean leaves the part where it is; see `leans`."""
+    load: Tensor
+    """(2 J,) what hinges lean by, along the two directions across each axis; 0: they do not."""
+    noise: Tensor
+    """(2 J, 2 J) covariance of tilts that no lean explains."""
 
     def __init__(self, kinds: tuple[JointKind, ...], count: int = 400) -> None:
         """A template of `count` points at the origin, to be filled by `assign`."""
@@ -94,6 +107,9 @@ class ArticulatedTemplate(nn.Module):
         self.axis = nn.Parameter(torch.ones(len(kinds), 3))
         self.pivot = nn.Parameter(torch.zeros(len(kinds), 3))
         self.register_buffer("normals", torch.zeros(count, 3))
+        self.register_buffer("rest", torch.zeros(len(kinds)))
+        self.register_buffer("load", torch.zeros(2 * len(kinds)))
+        self.register_buffer("noise", torch.eye(2 * len(kinds)))
 
     @torch.no_grad()
     def assign(
@@ -117,13 +133,31 @@ class ArticulatedTemplate(nn.Module):
         """
         made = ArticulatedTemplate(self.kinds, count).to(self.points)
         made.assign(self.points[:count], self.normals[:count], self.logit[:count])
-        made.axis.copy_(self.axis)
-        made.pivot.copy_(self.pivot)
+        for name in ("axis", "pivot", "rest", "load", "noise"):
+            getattr(made, name).copy_(getattr(self, name))
         return made
 
     def directions(self) -> Float[Tensor, "J 3"]:
         """Unit axes."""
         return F.normalize(self.axis, dim=-1)
+
+    def leans(self) -> bool:
+        """Whether hinges of this category lean."""
+        return bool(self.load.any())
+
+    def leaning(self, placement: Placement) -> Float[Tensor, "B J 3"]:
+        """Unit axes of each view's own hinges, template frame."""
+        turn = roma.rotvec_to_rotmat(placement.lean)
+        return (turn @ self.directions()[:, :, None])[..., 0]
+
+    def _hinged(self, j: int, placement: Placement) -> Float[Tensor, "B 3 3"]:
+        """How hinge j turns its part: from its rest about the axis that leans (`leans`)."""
+        axis, state = self.directions()[j], placement.state[:, j : j + 1]
+        if not bool(placement.lean[:, j].any()):
+            return roma.rotvec_to_rotmat(axis * state)
+        lean = roma.rotvec_to_rotmat(placement.lean[:, j])
+        onward = roma.rotvec_to_rotmat(axis * (state - self.rest[j]))
+        return lean @ onward @ lean.mT @ roma.rotvec_to_rotmat(axis * self.rest[j])
 
     def part_poses(self, placement: Placement) -> PartPoses:
         """view_T_part of every part at the placement's states (corrected bone map of Sec. 3.2)."""
@@ -133,7 +167,7 @@ class ArticulatedTemplate(nn.Module):
         for j, kind in enumerate(self.kinds):
             step = axis[j] * placement.state[:, j : j + 1]
             if kind == "revolute":
-                turn = roma.rotvec_to_rotmat(step)
+                turn = self._hinged(j, placement)
                 move = pivot[:, j] - (turn @ pivot[:, j, :, None])[..., 0]
             else:
                 turn, move = torch.eye(3).to(step).expand(len(step), 3, 3), step
@@ -145,9 +179,17 @@ class ArticulatedTemplate(nn.Module):
             rotation=torch.stack(rotations, 1), translation=torch.stack(translations, 1)
         )
 
-    def place(self, placement: Placement) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]]:
-        """Points and unit normals of the template in every view, parts blended by weight."""
-        poses, weight = self.part_poses(placement), self.logit.softmax(-1)
+    def place(
+        self, placement: Placement, poses: PartPoses | None = None
+    ) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]]:
+        """Points and unit normals of the template in every view, parts blended by weight.
+
+        Args:
+            placement: Of B views.
+            poses: Of the parts, if they are not as placed.
+        """
+        poses = self.part_poses(placement) if poses is None else poses
+        weight = self.logit.softmax(-1)
         scaled = self.points * placement.log_scale.exp()[:, None]
         points, normals = torch.zeros_like(scaled), torch.zeros_like(scaled)
         for p in range(weight.shape[1]):
@@ -176,7 +218,7 @@ class ArticulatedTemplate(nn.Module):
         pivot = torch.where(slides(self) > 0, self.part_centres()[1:], self.pivot)
         pivot = pivot * placement.log_scale.exp()[:, None] + placement.shift
         pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
-        return pivot, self.directions() @ placement.rotation.mT
+        return pivot, self.leaning(placement) @ placement.rotation.mT
 
 
 def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:

@@ -29,6 +29,7 @@ def drawn(kind: JointKind) -> tuple[ArticulatedTemplate, Placement]:
         log_scale=0.2 * torch.randn(4, 3, generator=g),
         state=torch.randn(4, 1, generator=g),
         shift=torch.randn(4, 1, 3, generator=g),
+        lean=torch.zeros(4, 1, 3),
     )
 
 
