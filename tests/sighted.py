@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from strategies import generator
 from torch import Tensor
@@ -52,10 +54,16 @@ def template(seed: int = 0, count: int = 400) -> ArticulatedTemplate:
     return made
 
 
-def sighted(count: int, seed: int = 0) -> tuple[Views, Placement]:
+def sighted(count: int, seed: int = 0, lean: float = 0.0) -> tuple[Views, Placement]:
     """Views of the object from about one side, at states 0 to 1, with their true placements.
 
     Only back faces are left out, as a convex object's view would.
+
+    Args:
+        count: Of views.
+        seed: Of all that is drawn.
+        lean: Every other view's hinge leans by this angle (rad) to one side, the others' to the
+            other; the flap rests flat at state 0.
     """
     g = generator(seed)
     rotation = random_rotations(count, g)
@@ -67,6 +75,7 @@ def sighted(count: int, seed: int = 0) -> tuple[Views, Placement]:
     for b in range(count):
         whole = template(seed + b + 1, 4000)
         placement = Placement.at(rotation[b : b + 1], torch.zeros(1, 3), state[b : b + 1])
+        placement.lean[..., 0] = lean * (-1) ** b
         with torch.no_grad():
             points, normals = (x[0] for x in whole.place(placement))
         seen = ((camera[b] - points) * normals).sum(-1) > 0
@@ -74,5 +83,5 @@ def sighted(count: int, seed: int = 0) -> tuple[Views, Placement]:
         centre = kept.mean(0)
         clouds.append((kept - centre)[torch.randperm(600, generator=g)])
         camera[b] -= centre
-        placements.append(Placement.at(rotation[b : b + 1], -centre[None], state[b : b + 1]))
+        placements.append(replace(placement, translation=-centre[None]))
     return observe(torch.stack(clouds), camera), Placement.cat(placements)

@@ -18,8 +18,9 @@ from scapo.template import ArticulatedTemplate, Placement
 from scapo.types import JointKind
 
 
+@pytest.mark.parametrize("lean", [0.0, 0.2])
 @pytest.mark.parametrize("kinds", [("revolute", "revolute"), ("prismatic",)])
-def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...]):
+def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], lean: float):
     g, joints = generator(0), len(kinds)
     made = ArticulatedTemplate(kinds, 20).double()
     with torch.no_grad():
@@ -36,7 +37,9 @@ def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...]):
         ),
         log_scale=0.2 * torch.randn(3, 3, generator=g).double(),
         shift=(shift - (shift * axis).sum(-1, keepdim=True) * axis) * sliding,
+        lean=lean * torch.randn(3, joints, 3, generator=g).double() * (1 - sliding),
     )
+    made.rest.copy_(torch.randn(joints, generator=g))
     index = torch.arange(20).expand(3, 20)
     with torch.no_grad():
         jacobian = _place(made, placement, index).jacobian

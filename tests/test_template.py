@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+import roma
 import torch
 from strategies import generator
 from torch.testing import assert_close
@@ -52,6 +55,26 @@ def test_parts_move_as_their_joint_says(kind: JointKind):
     spot = middle * placement.log_scale.exp() + placement.shift[:, 0]
     assert_close(seen, apply(view_T_base, spot[:, None]))
     assert_close(direction[:, 0], (placement.rotation @ axis[..., None])[..., 0])
+
+
+@torch.no_grad()
+def test_a_leaning_hinge_turns_its_part_about_its_own_axis_from_its_rest():
+    template, placement = drawn("revolute")
+    template.rest.copy_(torch.tensor([0.4]))
+    straight = replace(placement, shift=torch.zeros(4, 1, 3))
+    leaning = replace(straight, lean=0.2 * torch.randn(4, 1, 3, generator=generator(7)))
+    at_rest = torch.full((4, 1), 0.4)
+    still = template.part_poses(replace(leaning, state=at_rest))
+    upright = template.part_poses(replace(straight, state=at_rest))
+    assert_close(still.rotation, upright.rotation)
+    assert_close(still.translation, upright.translation)
+    pivot, axis = (x[:, 0] for x in template.joints_in_view(leaning))
+    onward = joint_motion(pivot, axis, (leaning.state - at_rest)[:, 0], "revolute")
+    moved = template.part_poses(leaning)
+    view_T_part = onward @ rigid(still.rotation[:, 1], still.translation[:, 1])
+    assert_close(rigid(moved.rotation[:, 1], moved.translation[:, 1]), view_T_part)
+    turned = roma.rotvec_to_rotmat(leaning.lean[:, 0]) @ template.directions()[0]
+    assert_close(axis, (leaning.rotation @ turned[..., None])[..., 0])
 
 
 def test_placements_are_taken_and_joined():
