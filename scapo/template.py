@@ -9,6 +9,7 @@ scales along the template's axes, and for prismatic joints where on the body the
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import roma
 import torch
@@ -110,6 +111,18 @@ class ArticulatedTemplate(nn.Module):
         self.register_buffer("rest", torch.zeros(len(kinds)))
         self.register_buffer("load", torch.zeros(2 * len(kinds)))
         self.register_buffer("noise", torch.eye(2 * len(kinds)))
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        *rest: Any,  # noqa: ANN401 - as torch calls it
+        **named: Any,  # noqa: ANN401
+    ) -> None:
+        """Hinges of a template that was saved without leans are straight."""
+        for name in ("rest", "load", "noise"):
+            state_dict.setdefault(prefix + name, getattr(self, name))
+        super()._load_from_state_dict(state_dict, prefix, *rest, **named)
 
     @torch.no_grad()
     def assign(

@@ -106,3 +106,12 @@ def test_a_lighter_template_has_the_first_points_and_the_same_joints():
     assert_close(light.place(placement)[0], template.place(placement)[0][:, :8])
     assert_close(light.joints_in_view(placement), template.joints_in_view(placement))
     assert torch.equal(repeated.points[20:40], template.points)
+
+
+def test_a_template_saved_without_leans_has_straight_hinges():
+    template, placement = drawn("revolute")
+    saved = {k: v for k, v in template.state_dict().items() if k not in ("rest", "load", "noise")}
+    back = ArticulatedTemplate(("revolute",), 20)
+    back.load_state_dict(saved)
+    assert not back.leans()
+    assert_close(back.place(placement), template.place(placement))
