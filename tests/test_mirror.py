@@ -42,13 +42,17 @@ def test_the_base_is_mirrored_and_the_part_is_not() -> None:
 
 
 @pytest.mark.slow
-def test_a_side_that_trusted_views_never_saw_is_there_after_a_round() -> None:
+def test_a_side_that_trusted_views_never_saw_is_there_after_a_round(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO", "scapo.discovery")
     views, truth = sighted(28, seed=91)
     config = DiscoveryConfig(rotations=300, trusted=(0.8,))
     left = Trusted(views=views, placement=truth).cameras()[:, 1] < -0.1
     seen = left.nonzero()[:, 0]
     trusted = Trusted(views=views.take(seen), placement=truth.take(seen))
     found, after = completed((without_a_side(), trusted), views, views, config, generator(0))
+    assert "kept: 2" in caplog.text  # 0 as it was, then its image along x, y, z
     base = found.logit.argmax(-1) == 0
     assert (found.normals[base, 1] > 0.8).sum() > 15
     assert (found.normals[base, 1] < -0.8).sum() > 15
