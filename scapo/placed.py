@@ -13,7 +13,7 @@ from scapo.geometry import rigid
 from scapo.joint_fit import NORMAL_LENGTH
 from scapo.points import Similarity, k_nearest
 from scapo.sightings import surface_normals
-from scapo.template import ArticulatedTemplate, Placement, slides
+from scapo.template import ArticulatedTemplate, PartPoses, Placement, slides
 from scapo.types import Joints, Prediction
 
 NEIGHBOURS = 12
@@ -32,6 +32,9 @@ def placed_prediction(
 ) -> Prediction:
     """The prediction that a placement in normalised frames stands for.
 
+    States and part frames are those from the template's own state, or where hinges lean from their
+    rest, so that every part is its base moved by its joint.
+
     Args:
         template: The category's.
         placement: Of each cloud.
@@ -39,12 +42,12 @@ def placed_prediction(
         similarity: The normalisation to undo.
         confidence: Handed on.
     """
-    poses = template.part_poses(placement)
+    poses = _from_rest(template, placement)
     origin = template.part_centres()[0] * placement.log_scale.exp()
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]
-    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state)
+    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state - template.rest)
     return Prediction(
         part_weight=part_weight,
         camera_T_part=similarity.inverse_pose(rigid(poses.rotation, move)),
@@ -54,15 +57,32 @@ def placed_prediction(
     )
 
 
+def _from_rest(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
+    """view_T_part with frames that all parts share with the base when hinges are at their rest."""
+    poses = template.part_poses(placement)
+    if not template.leans():
+        return poses
+    rested = template.part_poses(_at_rest(template, placement))
+    turn = poses.rotation @ rested.rotation.mT
+    gap = placement.translation[:, None] - rested.translation
+    return PartPoses(
+        rotation=turn @ placement.rotation[:, None],
+        translation=poses.translation + (turn @ gap[..., None])[..., 0],
+    )
+
+
+def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
+    """The placement with hinges that lean at their rest, others at the template's own state."""
+    return replace(placement, state=template.rest.expand_as(placement.state))
+
+
 @torch.no_grad()
 def canonical_points(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B M 3"]:
-    """The template in each cloud's size and the template's own state and frame."""
+    """The template in each cloud's size and the template's frame, in the state that counts as 0."""
     still = replace(
-        placement,
+        _at_rest(template, placement),
         rotation=torch.eye(3).to(placement.rotation).expand_as(placement.rotation),
         translation=torch.zeros_like(placement.translation),
-        state=torch.zeros_like(placement.state),
-        lean=torch.zeros_like(placement.lean),
     )
     return template.place(still)[0]
 

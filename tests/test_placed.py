@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 from sighted import sighted, template
 from strategies import generator
@@ -14,22 +17,28 @@ from scapo.points import normalise
 from scapo.template import ArticulatedTemplate, Placement, slides
 
 
+@pytest.mark.parametrize("lean", [0.0, 0.2])
 @torch.no_grad()
-def test_parts_and_joint_of_a_prediction_belong_together():
+def test_parts_and_joint_of_a_prediction_belong_together(lean: float):
     cloud = torch.randn(3, 50, 3, generator=generator(0)) + torch.tensor([0, 0, 4.0])
     _, similarity = normalise(cloud)
     rotation = random_rotations(3, generator(1))
     state = torch.tensor([[0.2], [0.7], [1.1]])
     placement = Placement.at(rotation, 0.1 * torch.randn(3, 3, generator=generator(2)), state)
+    placement = replace(placement, lean=lean * torch.randn(3, 1, 3, generator=generator(3)))
     shape = template()
+    if lean:
+        shape.rest.fill_(-0.3)
+        shape.load.fill_(0.1)
     weight = torch.full((3, 50, 2), 0.5)
     found = placed_prediction(shape, placement, weight, similarity, torch.ones(3))
     assert found.camera_T_part is not None
     assert found.joints is not None
     base, lid = found.camera_T_part.unbind(1)
     motion = joint_motion(
-        found.joints.pivot[:, 0], found.joints.axis[:, 0], state[:, 0], "revolute"
+        found.joints.pivot[:, 0], found.joints.axis[:, 0], found.joints.state[:, 0], "revolute"
     )
+    assert_close(found.joints.state, state - shape.rest)
     assert_close(lid, motion @ base, atol=1e-4, rtol=0)
     centre = apply(base, shape.part_centres()[0].expand(3, 1, 3) * 0)
     expected = similarity.inverse(
