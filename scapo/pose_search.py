@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from scapo.joint_fit import search_states, thin, view_loss
@@ -155,24 +155,12 @@ class Finalists:
     placement: Placement
     loss: Float[Tensor, "B F"]
 
-    def charged(self, states: StateRange | None) -> Float[Tensor, "B F"]:
-        """Losses; those with states outside the range are charged for it."""
-        if states is None:
-            return self.loss
-        return self.loss + states.penalty(self.placement.state.unflatten(0, self.loss.shape))
-
-    def best(
-        self, states: StateRange | None = None, cost: Float[Tensor, "B F"] | None = None
-    ) -> Found:
-        """The best of each view.
-
-        Args:
-            states: Range outside which states are charged.
-            cost: What else is charged when they are chosen, and is not part of their loss.
-        """
-        loss = self.charged(states)
-        chosen = (loss if cost is None else loss + cost).argmin(1)
-        return found_at(self.placement, loss, chosen)
+    def best(self, states: StateRange | None = None) -> Found:
+        """The best of each view; those with states outside the range are charged for it."""
+        loss = self.loss
+        if states is not None:
+            loss = loss + states.penalty(self.placement.state.unflatten(0, loss.shape))
+        return best_of(self.placement, loss.flatten(), len(loss))
 
 
 def settle_states(
@@ -187,14 +175,15 @@ def settle_states(
     return placement
 
 
-def found_at(placement: Placement, loss: Float[Tensor, "B F"], chosen: Int[Tensor, " B"]) -> Found:
-    """The chosen one of F hypotheses of each view, those of a view in a row, and its margin."""
-    count, number = loss.shape
-    index = torch.arange(count, device=loss.device) * number + chosen
-    placed, own = placement.take(index), loss.flatten()[index]
-    trace = placement.rotation.view(count, -1, 3, 3) * placed.rotation[:, None]
-    other = torch.where(within(trace.sum((-1, -2)), 30.0), 2.0, loss).amin(1)
-    return Found(placement=placed, loss=own, margin=other - own)
+def best_of(placement: Placement, loss: Float[Tensor, " H"], count: int) -> Found:
+    """The best of the hypotheses of each of `count` views, and its margin."""
+    table = loss.view(count, -1)
+    best = table.argmin(1)
+    index = torch.arange(count, device=loss.device) * table.shape[1] + best
+    chosen = placement.take(index)
+    trace = placement.rotation.view(count, -1, 3, 3) * chosen.rotation[:, None]
+    other = torch.where(within(trace.sum((-1, -2)), 30.0), 2.0, table).amin(1)
+    return Found(placement=chosen, loss=loss[index], margin=other - loss[index])
 
 
 def search(template: ArticulatedTemplate, views: Views, space: SearchSpace) -> Finalists:

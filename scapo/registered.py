@@ -23,7 +23,6 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from scapo.camera_prior import CameraPrior, agreed
 from scapo.discovery import discover, search_all, trust_order
 from scapo.leans import settle_leans
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
@@ -133,8 +132,6 @@ class RegisteredScapo(AbstractMethod):
         self.template.load_state_dict(template.state_dict())
         finalists = search_all(self.template, views, trusted, self.config.discovery)
         states = range_of(trusted.placement.state, self.template.kinds)
-        if self.config.camera_prior:
-            return agreed(finalists, views, states.wider(0.1))
         return finalists.best(states.wider(0.1))
 
     def _set_pseudo(self, key: Tensor, views: Views, found: Found) -> None:
@@ -269,11 +266,7 @@ class RegisteredScapo(AbstractMethod):
         if self.config.grid_hypotheses:
             start.append(propose(self.template, views, space))
         finalists = tournament(self.template, views, interleave(start, len(points)), space.states)
-        states = self._states().wider(0.1)
-        if self.config.camera_prior:
-            found = self._prior().best(finalists, views, states)
-        else:
-            found = finalists.best(states)
+        found = finalists.best(self._states().wider(0.1))
         final = found.placement
         if self.config.settle:
             final = settle_states(self.template, views, found, self._states())
@@ -285,15 +278,12 @@ class RegisteredScapo(AbstractMethod):
         """Of the trusted training views."""
         return range_of(self.pseudo.state[self.pseudo.trust > 0], self.template.kinds)
 
-    def _prior(self) -> CameraPrior:
-        """Of the trusted training views."""
-        return CameraPrior(cameras=F.normalize(self.pseudo.camera[self.pseudo.trust > 0], dim=-1))
-
     def _space(self) -> SearchSpace:
         """States and cameras of the trusted training views."""
+        trusted = self.pseudo.trust > 0
         return SearchSpace(
             states=self._states().wider(0.2).grid(7 if len(self.template.kinds) == 1 else 4),
             rotations=rotation_grid(self.config.discovery.rotations).to(self.pseudo.camera),
-            cameras=self._prior().cameras,
+            cameras=F.normalize(self.pseudo.camera[trusted], dim=-1),
             keep=self.config.grid_hypotheses,
         )

@@ -32,8 +32,6 @@ class RegisteredConfig:
     """Whether points that do not belong to the object are left out."""
     settle: bool = True
     """Try all states again for the placement that won."""
-    camera_prior: bool = True
-    """Of poses that explain a view alike, take that whose camera stands where others do."""
     camera: Literal["known", "estimated"] = "known"
     """Whether `refine` takes the camera from the cloud's frame or from the network."""
 

@@ -12,7 +12,7 @@ from scapo.geometry import rotation_angle
 from scapo.pose_search import (
     Found,
     SearchSpace,
-    found_at,
+    best_of,
     search,
     settle_states,
     state_grid,
@@ -58,7 +58,6 @@ def test_the_best_and_its_margin():
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     rotation = torch.stack([torch.eye(3), turn, torch.eye(3), turn, turn, torch.eye(3)])
     start = Placement.at(rotation, torch.zeros(6, 3), torch.arange(6.0)[:, None])
-    loss = torch.tensor([[0.3, 0.2, 0.5], [0.1, 0.15, 0.4]])
-    found = found_at(start, loss, loss.argmin(1))
+    found = best_of(start, torch.tensor([0.3, 0.2, 0.5, 0.1, 0.15, 0.4]), 2)
     assert found.placement.state[:, 0].tolist() == [1, 3]
     assert torch.allclose(found.margin, torch.tensor([0.1, 0.3]))
