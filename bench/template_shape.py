@@ -13,6 +13,7 @@ from scapo import geometry
 from scapo.method import AbstractMethod
 from scapo.model import Scapo
 from scapo.registered import RegisteredScapo
+from scapo.template import Placement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,13 +40,15 @@ def template_shape(method: AbstractMethod) -> TemplateShape | None:
 
 def _registered(method: RegisteredScapo) -> TemplateShape:
     template = method.template
-    origin = template.part_centres()[0]
+    origin, none = template.part_centres()[0], torch.zeros_like(template.points[:1])
+    at_rest = Placement.at(torch.eye(3).to(none)[None], none, template.rest[None])
+    points, normals = template.place(at_rest)
     return TemplateShape(
-        points=_plain(template.points - origin),
+        points=_plain(points[0] - origin),
         weight=_plain(template.logit.softmax(-1)),
         pivot=_plain(template.pivot - origin),
         axis=_plain(template.directions()),
-        normals=_plain(template.normals),
+        normals=_plain(normals[0]),
     )
 
 

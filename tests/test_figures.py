@@ -36,6 +36,7 @@ from scapo.categories import category
 from scapo.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.registered import RegisteredScapo
 from scapo.registered_config import RegisteredConfig
+from scapo.template import Placement
 
 
 def answered_of(folder, name="laptop", change=None, **header):
@@ -188,6 +189,24 @@ def test_templates_of_both_methods() -> None:
     np.testing.assert_allclose(moved, moved[:1].repeat(len(moved), 0), atol=1e-6)
     base = shape.points[shape.weight.argmax(1) == 0]
     np.testing.assert_allclose(np.quantile(base, [0.02, 0.98], axis=0).mean(0), 0, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_template_whose_hinges_lean_is_drawn_from_their_rest() -> None:
+    method = RegisteredScapo(RegisteredConfig(), category("laptop"), generator(0))
+    template, g = method.template, generator(1)
+    for tensor in (template.points, template.logit, template.axis, template.pivot):
+        tensor.copy_(torch.randn(tensor.shape, generator=g))
+    template.normals.copy_(torch.randn(template.normals.shape, generator=g))
+    template.rest.fill_(0.6)
+    template.logit.mul_(40)
+    shape = template_shape(method)
+    assert shape is not None
+    drawn = at_states(shape, np.array([0.3]), np.array([True])).points
+    placed = Placement.at(torch.eye(3)[None], torch.zeros(1, 3), torch.tensor([[0.9]]))
+    points = template.place(placed)[0][0] - template.part_centres()[0]
+    hard = template.logit.softmax(-1).amax(-1) > 0.999999
+    np.testing.assert_allclose(drawn[hard], points[hard].numpy(), atol=1e-4)
 
 
 def test_figures_show_parts(tmp_path) -> None:
