@@ -52,7 +52,8 @@ def placed_prediction(
         part_weight=part_weight,
         camera_T_part=similarity.inverse_pose(rigid(poses.rotation, move)),
         joints=Joints(pivot=similarity.inverse(pivot), axis=axis, state=state),
-        canonical_points=canonical_points(template, placement) / similarity.scale[:, None, None],
+        canonical_points=(canonical_points(template, placement) - origin[:, None])
+        / similarity.scale[:, None, None],
         confidence=confidence,
     )
 

@@ -27,6 +27,9 @@ def test_parts_and_joint_of_a_prediction_belong_together(lean: float):
     placement = Placement.at(rotation, 0.1 * torch.randn(3, 3, generator=generator(2)), state)
     placement = replace(placement, lean=lean * torch.randn(3, 1, 3, generator=generator(3)))
     shape = template()
+    aside = torch.tensor([0.1, 0.2, -0.1])  # part frames sit at the base's middle, not the origin
+    shape.points.add_(aside)
+    shape.pivot.add_(aside)
     if lean:
         shape.rest.fill_(-0.3)
         shape.load.fill_(0.1)
@@ -46,6 +49,12 @@ def test_parts_and_joint_of_a_prediction_belong_together(lean: float):
     )
     assert_close(centre, expected, atol=1e-5, rtol=1e-5)
     assert_close(invert(base) @ base, torch.eye(4).expand(3, 4, 4), atol=1e-5, rtol=0)
+    assert found.canonical_points is not None  # what the poses map from
+    points = similarity.inverse(shape.place(placement)[0])
+    for part, pose in ((0, base), (1, lid)):
+        own = shape.logit.softmax(-1)[:, part] > 0.999
+        carried = apply(pose, found.canonical_points[:, own])
+        assert_close(carried, points[:, own], atol=2e-3, rtol=0)
     still = canonical_points(shape, placement)
     assert_close(still[0], still[2], atol=1e-6, rtol=0)
 
