@@ -11,8 +11,6 @@ appears under its name only when complete.
 from __future__ import annotations
 
 import re
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from jaxtyping import Float, Int
 
+from scapo.folders import whole_folder
 from scapo.types import JointKind
 
 RGBA = tuple[float, float, float, float]
@@ -74,7 +73,9 @@ class Joint:
 def write_urdf(
     folder: Path, links: Sequence[Link], joints: Sequence[Joint], name: str = "object"
 ) -> Path:
-    """Write `folder/mobility.urdf` and `folder/meshes/*.obj`, replacing the folder if it exists.
+    """Write `folder/mobility.urdf` and `folder/meshes/*.obj`.
+
+    A folder that this function wrote before, and that nobody has changed since, is replaced.
 
     Args:
         folder: Its name becomes visible only when all files are written.
@@ -86,13 +87,11 @@ def write_urdf(
         The path of `mobility.urdf`.
 
     Raises:
-        ValueError: Names that repeat or are unknown, links that are no tree, bad numbers.
+        ValueError: Names that repeat or are unknown, links that are no tree, bad numbers; a file, a
+            link or somebody else's folder in the way, which is left alone.
     """
     _check(folder, links, joints)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        temporary.chmod(0o755)
+    with whole_folder(folder) as temporary:
         (temporary / "meshes").mkdir()
         frames = link_origins(links, joints)
         for link in links:
@@ -101,19 +100,7 @@ def write_urdf(
                 (temporary / _mesh_name(link, number)).write_text(text, encoding="ascii")
         text = urdf_text(links, joints, name)
         (temporary / "mobility.urdf").write_text(text, encoding="utf-8", newline="\n")
-        _replace(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return folder / "mobility.urdf"
-
-
-def _replace(temporary: Path, folder: Path) -> None:
-    """Put the finished folder under its name; the old one, if any, is moved aside first."""
-    old = folder.with_name(f"{temporary.name}.old")
-    if folder.exists():
-        folder.replace(old)
-    temporary.replace(folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _check(folder: Path, links: Sequence[Link], joints: Sequence[Joint]) -> None:

@@ -12,16 +12,18 @@ import hashlib
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from scapo.categories import CATEGORIES
+from scapo.folders import refuse_foreign, swap
 from scapo.manifest import Instance, Manifest, ManifestError, Shard, read_manifest, shards_digest
 from scapo.store import SAMPLES, canonical_json, write, write_bytes
 from sim_assets.archives import read_bytes
-from sim_assets.card import write_card
+from sim_assets.card import CARD, write_card
 from sim_assets.sources.clouds import CloudFile, RawCloud
 from sim_assets.views import generator
 
@@ -70,13 +72,16 @@ class SplitWriter:
 
     def __enter__(self) -> SplitWriter:
         """Clear the place of what a run that was killed left there."""
-        check_target(self.folder, self.set_name)
+        refuse_foreign(self.folder, *self._mine())
         shutil.rmtree(self.place, ignore_errors=True)
         return self
 
     def __exit__(self, *exc: object) -> None:
         """Remove the place, unless it has been moved."""
         shutil.rmtree(self.place, ignore_errors=True)
+
+    def _mine(self) -> tuple[Callable[[Path], bool], str]:
+        return partial(made_from, self.set_name), f"data from {self.set_name}"
 
     def add(self, file: CloudFile, data: bytes, cloud: RawCloud) -> None:
         """One sample."""
@@ -117,12 +122,7 @@ class SplitWriter:
         self._flush()
         write_bytes(self.place / "manifest.json", self._manifest(refused).to_json().encode())
         write_card(self.place)
-        old = self.folder.with_name(f".{self.folder.name}.old")
-        shutil.rmtree(old, ignore_errors=True)
-        if self.folder.exists():
-            self.folder.replace(old)
-        self.place.replace(self.folder)
-        shutil.rmtree(old, ignore_errors=True)
+        swap(self.place, self.folder, *self._mine())
         return self.folder
 
     def _manifest(self, refused: int) -> Manifest:
@@ -159,25 +159,15 @@ class SplitWriter:
         )
 
 
-def check_target(folder: Path, set_name: str) -> None:
-    """A split may replace one of the same set, and nothing else.
-
-    Raises:
-        ValueError: Something else is there.
-    """
-    if not folder.exists():
-        return
-    found = "other files"
-    if folder.is_dir() and not any(folder.iterdir()):
-        return
+def made_from(set_name: str, folder: Path) -> bool:
+    """Whether a folder holds a split of that set and no other file."""
     try:
-        source = read_manifest(folder / "manifest.json").options.get("source")
-        if source == set_name:
-            return
-        found = f"data from {source}"
+        manifest = read_manifest(folder / "manifest.json")
     except ManifestError:
-        pass
-    raise ValueError(f"{folder}: expected nothing, or data from {set_name}, found {found}")
+        return False
+    own = {"manifest.json", CARD, *(shard.file for shard in manifest.shards)}
+    alone = all(path.name in own and not path.is_symlink() for path in folder.iterdir())
+    return alone and manifest.options.get("source") == set_name
 
 
 def sample(cloud: RawCloud, points: int, name: str) -> Row:

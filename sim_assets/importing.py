@@ -8,6 +8,7 @@ file that cannot be used is named with the reason and left out; nothing takes it
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -107,6 +108,8 @@ def import_set(
         text = " ".join(str(error).split())
         result.refused[what] = text.removeprefix(f"{what}: ")
 
+    if (path.resolve() if path.is_dir() else path.resolve().parent) == out.resolve():
+        raise ValueError(f"{out}: expected a folder outside the source, found the source itself")
     show = progress or (lambda what, done, total: None)
     if name in MODELS:
         _models(MODELS[name], path, out, result, (refuse, show))
@@ -121,6 +124,7 @@ Calls = tuple[Callable[[str, ValueError], None], Progress]
 def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls: Calls) -> None:
     refuse, show = calls
     folders = reader.find(path)
+    source = Path(os.path.commonpath([folder.path for folder in folders]))
     seen: dict[Path, str] = {}
     for done, folder in enumerate(folders):
         show("models", done, len(folders))
@@ -131,6 +135,7 @@ def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls:
                     f"{folder.path}: expected one model {folder.category}/{folder.id}, found "
                     f"{seen[target]} too"
                 )
+            refuse_inside(target, folder.path, source)
             model = reader.read(folder)
             result.written.append(write_urdf(target, model.links, model.joints, model.name))
         except ValueError as error:
@@ -142,12 +147,26 @@ def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls:
     show("models", len(folders), len(folders))
 
 
+def refuse_inside(target: Path, *sources: Path) -> None:
+    """Refuse a target that lies in what is read, or around it: it would overwrite originals.
+
+    Raises:
+        ValueError: Naming both.
+    """
+    place = target.resolve()
+    for source in sources:
+        real = source.resolve()
+        if place == real or real in place.parents or place in real.parents:
+            raise ValueError(f"{target}: expected a place outside the source, found it in {source}")
+
+
 def _clouds(
     reader: CloudReader, path: Path, wanted: tuple[Path, int], result: Imported, calls: Calls
 ) -> None:
     refuse, show = calls
     out, points = wanted
     files = sorted(reader.find(path), key=_split_of)
+    source = Path(os.path.commonpath([file.path.parent for file in files]))
     several = _several(files)
     done = 0
 
@@ -158,7 +177,8 @@ def _clouds(
             yield file
             done += 1
 
-    for (category, split, variant), members in groupby(files, key=_split_of):
+    for (category, split, variant), group in groupby(files, key=_split_of):
+        members = list(group)
         top = out / variant if (category, split) in several else out
         writer = SplitWriter(
             folder=top / (category or "misplaced") / (split or "misplaced"),
@@ -168,7 +188,8 @@ def _clouds(
             set_name=reader.SET,
             variant=variant,
         )
-        folder = import_split(reader, writer, counted(list(members)), refuse)
+        refuse_inside(writer.folder, *(file.path for file in members), source)
+        folder = import_split(reader, writer, counted(members), refuse)
         if folder is not None:
             result.written.append(folder)
             result.samples += writer.count

@@ -183,3 +183,47 @@ def test_names_of_categories():
     assert our_category("laptop_h") == "laptop"
     assert our_category("Trash Can") == "trash_can"
     assert our_category("..") == "models"
+
+
+@pytest.mark.parametrize("below", ["", "MDV02", "MDV02/oven", "MDV02/oven/0001", "MDV02/new"])
+@pytest.mark.parametrize("where", ["", "MDV02", "MDV02/oven", "MDV02/oven/0001"])
+def test_no_original_is_touched(where: str, below: str, tmp_path: Path):
+    obj = generate("oven", "train", 3, 0)
+    source = tmp_path / "set"
+    foreign.shape2motion(obj, source, "oven")
+    foreign.shape2motion(obj, source, "oven", "0002")
+    top = source / "MDV02/oven"
+    before = {path: path.read_bytes() for path in source.rglob("*") if path.is_file()}
+    path, out = source / where, source / below
+    try:
+        made = import_set("shape2motion", path, out)
+    except ValueError as error:
+        assert "outside the source" in str(error)  # noqa: PT017 - some places are free
+        made = Imported()
+    assert {path: path.read_bytes() for path in before} == before
+    top = path if path.name == "0001" else top
+    inside = out == path or top in (out / "oven/0001", *(out / "oven/0001").parents)
+    assert bool(made.written) != inside
+
+
+def test_a_link_into_the_source_is_no_way_around(tmp_path: Path):
+    obj = generate("oven", "train", 3, 0)
+    foreign.shape2motion(obj, tmp_path / "set", "oven")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/oven").symlink_to(next((tmp_path / "set").rglob("oven")))
+    before = {path: path.read_bytes() for path in (tmp_path / "set").rglob("*") if path.is_file()}
+    made = import_set("shape2motion", tmp_path / "set", tmp_path / "out")
+    assert not made.written
+    assert "outside the source" in next(iter(made.refused.values()))
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_foreign_folder_at_the_target_stays(tmp_path: Path):
+    obj = generate("oven", "train", 3, 0)
+    foreign.shape2motion(obj, tmp_path / "set", "oven")
+    (tmp_path / "out/oven/0001").mkdir(parents=True)
+    (tmp_path / "out/oven/0001/thesis.tex").write_text("years")
+    made = import_set("shape2motion", tmp_path / "set", tmp_path / "out")
+    assert not made.written
+    assert "left alone" in next(iter(made.refused.values()))
+    assert [path.name for path in (tmp_path / "out/oven/0001").iterdir()] == ["thesis.tex"]

@@ -108,8 +108,7 @@ def test_every_link_has_what_physics_needs(tmp_path: Path):
 def test_equal_input_gives_equal_bytes_and_replaces_the_folder(tmp_path: Path):
     links, joints = chain()
     write_urdf(tmp_path / "a", links, joints)
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b/old.obj").write_text("stale")
+    write_urdf(tmp_path / "b", [dataclasses.replace(links[0], name="root")], [])
     write_urdf(tmp_path / "b", links, joints)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*"))
     assert files == sorted(p.relative_to(tmp_path / "b") for p in (tmp_path / "b").rglob("*"))
