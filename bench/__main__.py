@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """`scapo-bench` = `python -m bench`: train, predict, score and tabulate.
 
-A verb is a frozen dataclass in `bench.verbs` (or beside its function) whose fields are the flags,
-with a method `run(console)`; `VERBS` lists them. Ends 0 on success, 1 on bad input or a failed
-job with one line, 2 on wrong usage, 130 when interrupted.
+A verb is a frozen dataclass in `bench.cli` whose fields are the flags, with a method
+`run(console)`; `VERBS` lists them. Ends 0 on success, 1 on bad input or a failed job with one
+line, 2 on wrong usage, 130 when interrupted.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.markup import escape
 
-from bench.predict import Predict
-from bench.train import prepare, train_verb
-from bench.verbs import VERBS
+from bench.cli.verbs import VERBS
+from bench.runs.predict import Predict
+from bench.runs.train import prepare, train_verb
 
 DESCRIPTION = "Train, predict, score and tabulate methods of articulated pose estimation."
 

@@ -24,7 +24,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from bench.pictures import predictions_picture, training_curve
+from bench.figures.pictures import predictions_picture, training_curve
 from scapo import store
 
 CALIBRATED = ("scapo", "registered")

@@ -12,13 +12,13 @@ import torch
 
 from bench.baselines.icp import Icp, IcpConfig
 from scapo.categories import category
-from scapo.checkpoint import config_from, load_arrays, read_checkpoint
-from scapo.files import Header
-from scapo.layout import StoreError
 from scapo.method import AbstractMethod
-from scapo.model import Scapo, ScapoConfig, cpu_config
-from scapo.registered import RegisteredScapo
-from scapo.registered_config import cpu_config as cpu_registered
+from scapo.paper.method import Scapo, ScapoConfig, cpu_config
+from scapo.registered.method import RegisteredScapo
+from scapo.registered.method import cpu_config as cpu_registered
+from scapo.store.checkpoint import config_from, load_arrays, read_checkpoint
+from scapo.store.files import Header
+from scapo.store.schema import StoreError
 from scapo.types import Category
 
 

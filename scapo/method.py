@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the training loop and the benchmark ask of a method, ours or a baseline."""
+"""What the training loop and the benchmark ask of a method, ours or a baseline.
+
+Methods that can be given labels at test time, such as ICP with true parts: declared by type.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from scapo.pictures import PictureData
+from scapo.drawing import PictureData
 from scapo.types import Category, Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "refine"]
@@ -77,7 +80,7 @@ def changes(
         default: Another of the same type.
         leave: Dotted names of fields that do not count.
 
-    >>> from scapo.starts import DiscoveryConfig
+    >>> from scapo.registered.initialisation import DiscoveryConfig
     >>> changed = DiscoveryConfig(draws=1, axis_weight=0.0, way_out=False)
     >>> changes(changed, DiscoveryConfig(), leave=["axis_weight"])
     ['way_out=False']
@@ -173,3 +176,18 @@ class AbstractMethod(nn.Module, ABC):
         """
         del observation, stage
         return {}
+
+
+class OracleMethod(AbstractMethod):
+    """A method that can also answer with true labels of the test split in hand.
+
+    Only `predict --oracle` shows it any, and only `labels.keep(oracle)`. The predictions file then
+    says `oracle-...` in its variant, and so does the row of every table.
+    """
+
+    oracle: frozenset[Supervision]
+    """The labels that it can use."""
+
+    @abstractmethod
+    def predict_given(self, observation: Observation, labels: Labels) -> Prediction:
+        """As `predict`, with the labels that `oracle` names."""

@@ -11,13 +11,12 @@ import torch
 from torch import Tensor
 
 from scapo.categories import CATEGORIES, category
-from scapo.checkpoint import config_from, load_arrays, read_checkpoint
-from scapo.files import Arrays, Header
-from scapo.layout import StoreError
 from scapo.method import Mode
-from scapo.model import Scapo, ScapoConfig
-from scapo.registered import RegisteredScapo
-from scapo.registered_config import RegisteredConfig
+from scapo.paper.method import Scapo, ScapoConfig
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.store.checkpoint import config_from, load_arrays, read_checkpoint
+from scapo.store.files import Arrays, Header
+from scapo.store.schema import StoreError
 from scapo.types import Joints, Observation, Prediction
 
 RELEASED = "weights"

@@ -17,7 +17,7 @@ def generate_samples(category: str, **options: Any) -> Iterator[Sample]:  # noqa
 
     Args:
         category: One of `scapo.CATEGORIES`.
-        options: The fields of `sim_assets.request.DataOptions`: count, instances, seed, split,
+        options: The fields of `sim_assets.options.DataOptions`: count, instances, seed, split,
             points, protocol, backend, source, ...
 
     Yields:
@@ -34,6 +34,8 @@ def generate_samples(category: str, **options: Any) -> Iterator[Sample]:  # noqa
         >>> sample.observation.points.shape
         torch.Size([1024, 3])
     """
-    from sim_assets.stream import stream  # here, so that `doctor` works without the extra `sim`
+    from sim_assets.generation.stream import (
+        stream,  # here, so that `doctor` works without the extra `sim`
+    )
 
     return stream(category, **options)

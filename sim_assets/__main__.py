@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`scapo-data` = `python -m sim_assets`: assets and the labelled clouds rendered from them.
 
-A verb is a frozen dataclass in `sim_assets.verbs` whose fields are the flags, with a method
+A verb is a frozen dataclass in `sim_assets.cli.verbs` whose fields are the flags, with a method
 `run(console)` that returns the exit code. Ends 0 on success, 1 on bad input or a failed job with
 one line, 2 on wrong usage, 130 when interrupted.
 """
@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from sim_assets.verbs import VERBS
+from sim_assets.cli.verbs import VERBS
 
 DESCRIPTION = "Make and look at labelled point clouds of articulated objects."
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sim_assets.doctor import PACKAGES
+from sim_assets.rendering.doctor import PACKAGES
 
 tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 

@@ -23,9 +23,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bench.oracle import OracleMethod
-from scapo.method import Mode, Stage, Step
-from scapo.points import MEAN_RADIUS, normalise
+from scapo.geometry.points import MEAN_RADIUS, normalise
+from scapo.method import Mode, OracleMethod, Stage, Step
 from scapo.types import Category, Labels, Observation, Prediction, Supervision
 
 Points = Float[np.ndarray, "N 3"]

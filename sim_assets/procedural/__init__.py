@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sim_assets.articulated import ArticulatedObject
+from sim_assets.objects import ArticulatedObject
 from sim_assets.procedural import (
     basket,
     drawer,

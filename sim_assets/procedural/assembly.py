@@ -14,7 +14,7 @@ import trimesh
 
 from scapo.categories import category as find_category
 from scapo.types import Category
-from sim_assets.articulated import ArticulatedObject, Origin, Visual
+from sim_assets.objects import ArticulatedObject, Origin, Visual
 from sim_assets.procedural.parameters import HeldOut
 
 VERSION = "scapo-procedural/1"

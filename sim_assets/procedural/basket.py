@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
@@ -22,16 +22,18 @@ from sim_assets.procedural.shapes import (
     FRONT,
     Loop,
     at,
+    box,
+    cylinder,
     loft,
     merged,
     mirrored,
     placed,
     rectangle,
     resampled,
+    slab,
     superellipse,
     sweep,
 )
-from sim_assets.procedural.solids import box, cylinder, slab
 
 TRAVEL = radians(85.0)
 COUNT = 80

@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Float
 from trimesh.triangles import closest_point
 
-from sim_assets.articulated import ArticulatedObject
+from sim_assets.objects import ArticulatedObject
 
 _CHUNK = 2_000_000
 """Point-triangle pairs handled at once."""

@@ -12,20 +12,25 @@ from math import pi
 import numpy as np
 import trimesh
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
     FRONT,
     at,
+    box,
+    cylinder,
+    ellipsoid,
+    lathe,
     loft,
     merged,
     placed,
     rectangle,
+    rounded_sides,
+    slab,
     superellipse,
     sweep,
 )
-from sim_assets.procedural.solids import box, cylinder, ellipsoid, lathe, rounded_sides, slab
 
 GAP = 0.002
 """Between a front and the boards beside or behind it."""

@@ -9,20 +9,23 @@ from math import radians
 import numpy as np
 import trimesh
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
     ALONG_Y,
     DOWN,
     at,
+    box,
+    cylinder,
     loft,
     merged,
     mirrored,
     placed,
     rectangle,
+    rounded_sides,
+    slab,
 )
-from sim_assets.procedural.solids import box, cylinder, rounded_sides, slab
 
 BLACK: RGB = (0.06, 0.06, 0.07)
 TRAVEL = radians(135.0)

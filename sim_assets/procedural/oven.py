@@ -12,7 +12,7 @@ from math import pi, radians
 import numpy as np
 import trimesh
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
@@ -20,14 +20,17 @@ from sim_assets.procedural.shapes import (
     ALONG_Y,
     FRONT,
     at,
+    box,
+    cylinder,
     loft,
     merged,
     placed,
     rectangle,
+    rounded_sides,
+    slab,
     superellipse,
     sweep,
 )
-from sim_assets.procedural.solids import box, cylinder, rounded_sides, slab
 
 STEEL: RGB = (0.72, 0.73, 0.74)
 BLACK: RGB = (0.08, 0.08, 0.09)

@@ -12,7 +12,7 @@ from math import radians
 import numpy as np
 import trimesh
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
 from sim_assets.procedural.shapes import (
@@ -20,12 +20,18 @@ from sim_assets.procedural.shapes import (
     ALONG_Y,
     FRONT,
     at,
+    box,
+    cylinder,
+    ellipsoid,
+    lathe,
     loft,
     merged,
     placed,
     rectangle,
+    rounded_sides,
+    slab,
+    tub,
 )
-from sim_assets.procedural.solids import box, cylinder, ellipsoid, lathe, rounded_sides, slab, tub
 
 STEEL: RGB = (0.7, 0.71, 0.72)
 BLACK: RGB = (0.08, 0.08, 0.09)

@@ -14,11 +14,20 @@ from math import radians
 import numpy as np
 import trimesh
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, span, tint
-from sim_assets.procedural.shapes import loft, merged, placed, rectangle, superellipse, sweep
-from sim_assets.procedural.solids import cylinder, ellipsoid, lathe
+from sim_assets.procedural.shapes import (
+    cylinder,
+    ellipsoid,
+    lathe,
+    loft,
+    merged,
+    placed,
+    rectangle,
+    superellipse,
+    sweep,
+)
 
 STEEL: RGB = (0.72, 0.73, 0.75)
 TRAVEL = radians(60.0)

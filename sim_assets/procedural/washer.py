@@ -14,11 +14,22 @@ from math import radians
 import numpy as np
 import trimesh
 
-from sim_assets.articulated import Visual
+from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
 from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
-from sim_assets.procedural.shapes import FRONT, at, loft, merged, placed, rectangle, superellipse
-from sim_assets.procedural.solids import box, cylinder, lathe, slab
+from sim_assets.procedural.shapes import (
+    FRONT,
+    at,
+    box,
+    cylinder,
+    lathe,
+    loft,
+    merged,
+    placed,
+    rectangle,
+    slab,
+    superellipse,
+)
 
 STEEL: RGB = (0.72, 0.73, 0.75)
 BLACK: RGB = (0.08, 0.08, 0.09)

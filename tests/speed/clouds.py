@@ -27,13 +27,13 @@ from typing import Any
 
 import numpy as np
 
-from sim_assets.build import write_object
+from sim_assets.generation.build import write_object
+from sim_assets.generation.request import make_request
 from sim_assets.options import DataOptions
 from sim_assets.procedural import generate
-from sim_assets.renderer import make_renderer
-from sim_assets.request import make_request
-from sim_assets.samples import Shooter
-from sim_assets.views import Outline, View, draw_views, generator
+from sim_assets.rendering.backends import make_renderer
+from sim_assets.sampling.samples import Shooter
+from sim_assets.sampling.viewpoints import Outline, View, draw_views, generator
 
 OBJECTS, EACH, ROUNDS = 4, 50, 5
 SHORT, LONG = 1000, 5000
@@ -50,7 +50,7 @@ def bare_loop(
         warnings.simplefilter("ignore")
         import sapien  # noqa: TID251 - the bare loop is what we are compared with
 
-        from sim_assets.scene import CAMERA_T_ROBOT, COLOR_SHADER, find_device
+        from sim_assets.rendering.sapien import CAMERA_T_ROBOT, COLOR_SHADER, find_device
 
         scene = sapien.Scene(
             [sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(find_device())]

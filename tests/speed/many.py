@@ -13,13 +13,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
+from sim_assets.generation.request import make_request, versions
 from sim_assets.options import DataOptions
-from sim_assets.parallel_scene import ManiSkillRenderer
-from sim_assets.renderer import Ask
-from sim_assets.request import make_request, versions
-from sim_assets.samples import Shooter
-from sim_assets.together import divide, shoot_together
-from sim_assets.views import draw_views, generator
+from sim_assets.rendering.base import Ask
+from sim_assets.rendering.maniskill import ManiSkillRenderer
+from sim_assets.sampling.samples import Shooter, divide, shoot_together
+from sim_assets.sampling.viewpoints import draw_views, generator
 
 OBJECTS = 16
 """Different objects at most; more places show them several times."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import made
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from bench.evaluate import Request, evaluate
-from bench.predictions import write_predictions
+from bench.scoring.evaluate import Request, evaluate
+from bench.scoring.predictions import write_predictions
+from tests.helpers import made
 
 COUNT = 4000
 SAMPLES_PER_SECOND = 100_000 / 120

@@ -16,10 +16,11 @@ from typing import Any
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from sim_assets.generation.request import make_request
+from sim_assets.generation.stream import _samples
 from sim_assets.options import DataOptions
-from sim_assets.renderer import RenderError, resolve_backend
-from sim_assets.request import make_request
-from sim_assets.stream import _samples
+from sim_assets.rendering.backends import resolve_backend
+from sim_assets.rendering.base import RenderError
 
 SHARE = 0.8
 """Of the bare loops' rate that the command must reach."""

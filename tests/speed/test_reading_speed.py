@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from made import sample_arrays, write_split
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch.utils.data import DataLoader
 
 from scapo.store import dataset
+from tests.helpers.made import sample_arrays, write_split
 
 SAMPLES, POINTS, BATCH = 2000, 1024, 64
 LEAST = 100.0

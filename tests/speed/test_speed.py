@@ -11,10 +11,10 @@ import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch import Tensor
 
-from scapo import points
-from scapo.autoencoder import Encoder, EncoderConfig
-from scapo.skinning import Bones
-from scapo.vector_neurons import VNBlock, initialise
+from scapo.geometry import points
+from scapo.paper.autoencoder import Encoder, EncoderConfig
+from scapo.paper.skinning import Bones
+from scapo.paper.vector_neurons import VNBlock, initialise
 
 BATCH, POINTS, PARTS = 8, 1024, 2
 SAMPLES = 64
@@ -80,7 +80,8 @@ def test_encoder(benchmark: BenchmarkFixture, clouds: Tensor):
 @pytest.mark.parametrize("category", ["laptop", "oven"])
 def test_generate(benchmark: BenchmarkFixture, category: str, backend: str):
     """Labelled clouds of one instance at 256 x 256; clouds per second are 64 over the median."""
-    from sim_assets import doctor, generate_samples
+    from sim_assets import generate_samples
+    from sim_assets.rendering import doctor
 
     if not doctor.probe(backend).works:
         pytest.skip(f"{backend} does not work here")

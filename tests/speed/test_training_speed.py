@@ -26,9 +26,9 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from scapo.categories import CATEGORIES
+from scapo.geometry.points import normalise
 from scapo.method import Step
-from scapo.model import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
-from scapo.points import normalise
+from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
 from scapo.types import Labels, Observation
 
 POINTS = 1024

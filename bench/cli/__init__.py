@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The command line `scapo-bench`: verbs that parse, call one function, and print."""

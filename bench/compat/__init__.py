@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: MIT
+"""The published evaluators' readings, for comparison with printed numbers only."""
+
+from bench.compat.eap import eap_calibration, eap_iou, eap_rotation
+from bench.compat.readings import RECORD, opalign, score_record, standardise
+
+__all__ = [
+    "RECORD",
+    "eap_calibration",
+    "eap_iou",
+    "eap_rotation",
+    "opalign",
+    "score_record",
+    "standardise",
+]

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""What a run shows: predictions, templates, overlays."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Predictions and truth to errors per sample: `evaluate.evaluate`."""

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""The frames of a method that saw no poses, fitted on its predictions of the training split.
+
+One rigid offset per part and one offset per joint state (PROTOCOL 1.6, 1.9), lengths in units of
+4 x the mean radius of each cloud. Truth is ordered and symmetry-corrected first, as in scoring.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from bench.matching import (
+    Calibration,
+    accuracies,
+    calibrate,
+    confusion,
+    hard_labels,
+    part_orders,
+    reorder_joints,
+    reorder_poses,
+)
+from bench.scoring.predictions import Header, Predictions
+from bench.scoring.scores import Frames, Rows, Settings, agreement_of, label_of, signs
+from bench.scoring.truth import Truth, blocks
+from scapo.store import Split, StoreError
+
+CALIBRATION_SPLIT = "train"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fitted:
+    """What the training predictions said of a method's frames."""
+
+    poses: Calibration | None
+    """None where the method gives no poses."""
+    state_offset: Float[np.ndarray, " J"] | None
+    """Radians, or r4 for a prismatic joint; None where it gives no states."""
+    state_count: tuple[int, ...]
+    """Samples behind each state offset."""
+    order: Int[np.ndarray, " P"] | None
+    """The one part order of the data set, where asked for."""
+    samples: int
+
+    def record(self) -> dict[str, Any]:
+        """For JSON, NaN as null."""
+        out: dict[str, Any] = {"samples": self.samples, "split": CALIBRATION_SPLIT}
+        if self.poses is not None:
+            out |= {
+                "seed": self.poses.seed,
+                "own_T_part": _plain(self.poses.offsets),
+                "rotation_inlier_ratio": _plain(self.poses.rotation_inliers),
+                "translation_inlier_ratio": _plain(self.poses.translation_inliers),
+                "answered": self.poses.answered.tolist(),
+            }
+        if self.state_offset is not None:
+            out |= {
+                "state_offset": _plain(self.state_offset),
+                "state_answered": list(self.state_count),
+            }
+        return out
+
+
+def _plain(values: np.ndarray) -> Any:  # noqa: ANN401
+    """Nested lists, NaN as None."""
+    if values.ndim > 1:
+        return [_plain(value) for value in values]
+    return [value if value == value else None for value in values.tolist()]
+
+
+def check_calibration(path: Path, header: Header, tested: Header) -> None:
+    """Refuse predictions that must not calibrate these.
+
+    Raises:
+        StoreError: Of the split that is scored, or of another method, variant, seed or category.
+    """
+    if header.data_digest == tested.data_digest or header.split != CALIBRATION_SPLIT:
+        raise StoreError(
+            f"{path}: expected predictions on the split {CALIBRATION_SPLIT!r} for "
+            f"calibration, found split {header.split!r} with data digest "
+            f"{header.data_digest!r}"
+        )
+    for name in ("method", "variant", "seed", "category"):
+        want, have = getattr(tested, name), getattr(header, name)
+        if want != have:
+            raise StoreError(
+                f"{path}: header field {name!r}: expected {want!r} as in the "
+                f"predictions to be scored, found {have!r}"
+            )
+
+
+def fit(path: Path, split: Split, *, settings: Settings, frames: Frames, seed: int = 0) -> Fitted:
+    """Fit offsets on the predictions `path` of the training split.
+
+    Raises:
+        StoreError: The file is not valid or not of this split.
+    """
+    gathered = _Gathered()
+    with Predictions(path, split) as predictions:
+        order = None
+        if settings.label_order == "dataset":
+            order = dataset_order(predictions, split)
+        for truth in blocks(split):
+            rows = predictions.rows(truth.first, len(truth))
+            gathered.add(truth, rows, settings, frames, order)
+        predictions.finish()
+    poses = None
+    if gathered.pred:
+        poses = calibrate(
+            np.concatenate(gathered.pred),
+            np.concatenate(gathered.true),
+            scale=np.concatenate(gathered.scale),
+            seed=seed,
+        )
+    offset, count = None, ()
+    if gathered.residual:
+        offset, count = _state_offsets(np.concatenate(gathered.residual), frames.revolute)
+    return Fitted(
+        poses=poses,
+        state_offset=offset,
+        state_count=count,
+        order=order,
+        samples=split.manifest.count,
+    )
+
+
+class _Gathered:
+    """Poses and state residuals of the training split: a few numbers per sample."""
+
+    def __init__(self) -> None:
+        self.pred: list[np.ndarray] = []
+        self.true: list[np.ndarray] = []
+        self.scale: list[np.ndarray] = []
+        self.residual: list[np.ndarray] = []
+
+    def add(
+        self,
+        truth: Truth,
+        rows: Rows,
+        settings: Settings,
+        frames: Frames,
+        order: Int[np.ndarray, " P"] | None,
+    ) -> None:
+        agreement = agreement_of(truth, rows, settings, order)
+        if "camera_T_part" in rows:
+            self.pred.append(rows["camera_T_part"].astype(np.float64))
+            self.true.append(reorder_poses(truth.camera_T_part, agreement.order, frames.symmetry))
+            self.scale.append(truth.scale)
+        if "joint_state" in rows:
+            axis = reorder_joints(truth.joint_axis, agreement.order)
+            state = reorder_joints(truth.joint_state, agreement.order)
+            unit = np.where(frames.revolute, 1.0, truth.scale[:, None])
+            sign = signs(rows, agreement.order, axis)
+            self.residual.append((state - sign * rows["joint_state"]) / unit)
+
+
+def _state_offsets(
+    residual: Float[np.ndarray, "B J"], revolute: np.ndarray
+) -> tuple[Float[np.ndarray, " J"], tuple[int, ...]]:
+    """Circular mean of theta - s phi, or mean for a prismatic joint; NaN without an answer."""
+    offsets, counts = [], []
+    for joint in range(residual.shape[1]):
+        values = residual[:, joint]
+        values = values[np.isfinite(values)]
+        counts.append(len(values))
+        if len(values) == 0:
+            offsets.append(np.nan)
+        elif revolute[joint]:
+            offsets.append(float(np.arctan2(np.sin(values).mean(), np.cos(values).mean())))
+        else:
+            offsets.append(float(values.mean()))
+    return np.array(offsets), tuple(counts)
+
+
+def dataset_order(predictions: Predictions, split: Split) -> Int[np.ndarray, " P"]:
+    """The one order with the highest mean accuracy over the whole split."""
+    parts = len(split.manifest.parts)
+    orders = part_orders(parts)
+    total = np.zeros(len(orders))
+    for truth in blocks(split):
+        rows = predictions.rows(truth.first, len(truth))
+        counts = confusion(truth.part, hard_labels(label_of(rows)), parts)
+        total += accuracies(counts, orders).sum(0)
+    predictions.unanswered.clear()
+    return orders[total.argmax()]

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""The truth of a split in blocks of bounded size, whatever the size of its shards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from safetensors import SafetensorError, safe_open
+
+from scapo.categories import CATEGORIES
+from scapo.store import SAMPLES, Split, StoreError, read_header
+from scapo.store.manifest import Manifest
+from scapo.store.samples import UNLABELLED
+
+BLOCK = 1024
+"""Samples in memory at a time."""
+
+_DTYPES = {
+    "points": "F32",
+    "part": "U8",
+    "camera_T_part": "F32",
+    "joint_pivot": "F32",
+    "joint_axis": "F32",
+    "joint_state": "F32",
+    "visible": "F32",
+    "instance": "I32",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Consecutive samples of one split. Camera frame, metres, radians."""
+
+    first: int
+    points: Float[np.ndarray, "B N 3"]
+    part: Int[np.ndarray, "B N"]
+    """-1 = background or unlabelled."""
+    camera_T_part: Float[np.ndarray, "B P 4 4"]
+    joint_pivot: Float[np.ndarray, "B J 3"]
+    joint_axis: Float[np.ndarray, "B J 3"]
+    joint_state: Float[np.ndarray, "B J"]
+    visible: Float[np.ndarray, "B P"]
+    instance: Int[np.ndarray, " B"]
+    scale: Float[np.ndarray, " B"]
+    """Metres of one unit `r4`: 4 x the mean distance of the cloud's points from their centroid."""
+
+    def __len__(self) -> int:
+        return len(self.instance)
+
+
+def symmetry(manifest: Manifest) -> Float[np.ndarray, "3 3"] | None:
+    """The rotation of the object frame that exchanges the parts, None where there is none."""
+    known = CATEGORIES.get(manifest.category)
+    if known is None or known.symmetry is None:
+        return None
+    return np.array(known.symmetry, np.float64)
+
+
+def revolute(manifest: Manifest) -> np.ndarray:
+    """Which joints turn, (J,) bool."""
+    return np.array([joint.kind == "revolute" for joint in manifest.joints])
+
+
+def blocks(split: Split, size: int = BLOCK) -> Iterator[Truth]:
+    """The split's samples in order, at most `size` at a time.
+
+    Raises:
+        StoreError: A shard is missing, not what the manifest says, or not finite.
+    """
+    for shard in split.manifest.shards:
+        path = split.folder / shard.file
+        _check_shard(path, split, shard.count)
+        try:
+            with safe_open(path, "numpy") as file:
+                slices = {name: file.get_slice(name) for name in _DTYPES}
+                for start in range(0, shard.count, size):
+                    stop = min(start + size, shard.count)
+                    rows = {name: item[start:stop] for name, item in slices.items()}
+                    yield _truth(path, shard.first + start, rows)
+        except SafetensorError as error:
+            raise StoreError(f"{path}: expected readable tensors, found {error}") from error
+
+
+def _check_shard(path: Path, split: Split, count: int) -> None:
+    read_header(path, SAMPLES)
+    with safe_open(path, "numpy") as file:
+        names = set(file.keys())
+        for name, dtype in _DTYPES.items():
+            if name not in names:
+                raise StoreError(f"{path}: expected tensor {name!r}, found none")
+            item = file.get_slice(name)
+            if item.get_dtype() != dtype:
+                raise StoreError(
+                    f"{path}: tensor {name!r}: expected {dtype}, found {item.get_dtype()}"
+                )
+            found = tuple(item.get_shape())
+            expected = split.shapes(count)[name]
+            if found != expected:
+                raise StoreError(
+                    f"{path}: tensor {name!r}: expected shape {expected}, found {found}"
+                )
+
+
+def _truth(path: Path, first: int, rows: dict[str, np.ndarray]) -> Truth:
+    points = rows["points"]
+    centred = points - points.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
+    radius = np.sqrt(np.einsum("bnc,bnc->bn", centred, centred)).mean(1, dtype=np.float64)
+    usable = np.isfinite(radius) & (radius > 0)
+    if not usable.all():
+        raise StoreError(
+            f"{path}: sample {first + int(usable.argmin())}: expected finite points "
+            "that differ, found mean radius 0 or NaN"
+        )
+    part = rows["part"].astype(np.int16)
+    part[part == UNLABELLED] = -1
+    wide = {
+        name: rows[name].astype(np.float64)
+        for name in ("camera_T_part", "joint_pivot", "joint_axis", "joint_state", "visible")
+    }
+    return Truth(
+        first=first,
+        points=points,
+        part=part,
+        instance=rows["instance"].astype(np.int64),
+        scale=4 * radius,
+        **wide,
+    )

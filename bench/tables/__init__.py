@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The paper's tables from scores per sample: `write.write`."""

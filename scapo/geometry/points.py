@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""Nearest neighbours, Chamfer distance, farthest-point sampling and normalisation of clouds.
+
+Neighbours are found without autograd and gradients pass through the matched points only: the
+gradient is the same and no (N, M) matrix is kept for the backward pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from scapo.geometry.numerics import exact, uncompiled
+
+
+@torch.no_grad()
+def nearest(
+    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"]
+) -> Int[Tensor, "*B N"]:
+    """Index into `target` of the nearest neighbour of each source point.
+
+    Raises:
+        ValueError: `target` has no points.
+    """
+    return _search(source, target, 1)[..., 0]
+
+
+@torch.no_grad()
+def k_nearest(
+    source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"], k: int
+) -> Int[Tensor, "*B N {k}"]:
+    """Indices into `target` of the k nearest neighbours of each source point, nearest first.
+
+    Points of space, or features of any dimension D.
+
+    Raises:
+        ValueError: `target` has fewer than k points.
+    """
+    return _search(source, target, k)
+
+
+@uncompiled  # blocks, numpy and exact arithmetic are no matter for a compiler
+def _search(
+    source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"], k: int
+) -> Int[Tensor, "*B N {k}"]:
+    """The k smallest scores |t|^2 - 2 s.t of each row, a block of the score matrix at a time.
+
+    The clouds are moved to the target's centroid first: without that, coordinates a metre off
+    cost float32 three digits. Half precision is searched in float32.
+    """
+    n, m = source.shape[-2], target.shape[-2]
+    if not 1 <= k <= m:
+        raise ValueError(f"neighbours: expected 1 to {m}, the points of the target, found {k}")
+    clouds = math.prod(source.shape[:-2])
+    dtype = torch.promote_types(source.dtype, torch.float32)
+    centre = target.to(dtype).mean(-2, keepdim=True)
+    source, target = source.to(dtype) - centre, target.to(dtype) - centre
+    left = torch.cat([source, torch.ones_like(source[..., :1])], -1)
+    wide = left.shape[-1]
+    right = torch.cat([-2 * target, target.square().sum(-1, keepdim=True)], -1).mT
+    found = [
+        _smallest(scores) if k == 1 else scores.topk(k, largest=False).indices
+        for scores in _products(left.reshape(clouds, n, wide), right.reshape(clouds, wide, m))
+    ]
+    rows = [index.reshape(-1, k) for index in found]
+    empty = torch.zeros(0, k, dtype=torch.long, device=source.device)
+    return torch.cat([empty, *rows]).reshape(*source.shape[:-1], k)
+
+
+BLOCK = 1 << 19
+"""Scores held at a time on the CPU: 2 MiB in float32, about a core's cache."""
+
+
+def _products(
+    left: Float[Tensor, "B N D"], right: Float[Tensor, "B D M"]
+) -> Iterator[Float[Tensor, "_ _ M"]]:
+    """The product left @ right, in order, as many clouds, or rows of one, at a time as fit."""
+    n, m = left.shape[1], right.shape[2]
+    on_cpu = left.device.type == "cpu"
+    block = BLOCK if on_cpu else 128 * BLOCK
+    clouds, rows = max(1, block // max(1, n * m)), max(1, block // m)
+    with exact(left.device.type):  # fewer digits would find the wrong neighbours
+        for some, others in zip(left.split(clouds), right.split(clouds), strict=True):
+            for part in some.split(rows, dim=1):
+                yield _numpy_product(part, others) if on_cpu else part @ others
+
+
+def _numpy_product(
+    left: Float[Tensor, "B N D"], right: Float[Tensor, "B D M"]
+) -> Float[Tensor, "B N M"]:
+    """The same by numpy, whose OpenBLAS takes a sixth of MKL's time for matrices this thin."""
+    return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))
+
+
+def _smallest(scores: Float[Tensor, "B N M"]) -> Int[Tensor, "B N 1"]:
+    """Index of the smallest score of each row; numpy's is vectorised, torch's on a CPU not."""
+    if scores.device.type == "cpu":
+        return torch.from_numpy(scores.numpy().argmin(-1))[..., None]
+    return scores.argmin(-1, keepdim=True)
+
+
+def gather(points: Float[Tensor, "*B M C"], index: Int[Tensor, "*B K"]) -> Float[Tensor, "*B K C"]:
+    """points[..., index, :] per batch element."""
+    return points.gather(-2, index[..., None].expand(*index.shape, points.shape[-1]))
+
+
+def squared_distances(
+    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"]
+) -> Float[Tensor, "*B N"]:
+    """Squared distance of each source point to its nearest target point, with gradients."""
+    return (source - gather(target, nearest(source, target))).square().sum(-1)
+
+
+def chamfer(a: Float[Tensor, "*B N 3"], b: Float[Tensor, "*B M 3"]) -> Float[Tensor, "*B"]:
+    """Mean squared nearest-neighbour distance, both ways added."""
+    return squared_distances(a, b).mean(-1) + squared_distances(b, a).mean(-1)
+
+
+def robust_chamfer(
+    a: Float[Tensor, "*B N 3"],
+    b: Float[Tensor, "*B M 3"],
+    *,
+    forward: float,
+    backward: float,
+) -> Float[Tensor, "*B"]:
+    """mean(1 - exp(-f D_ab)) + (f / b) mean(1 - exp(-b D_ba)), D squared distances.
+
+    OP-Align's form for partial clouds (PROTOCOL 3.1, L_rigid), f = `forward`, b = `backward`:
+    a point of the shape far from every observed point costs a bounded amount.
+    """
+    there = 1 - torch.exp(-forward * squared_distances(a, b))
+    back = 1 - torch.exp(-backward * squared_distances(b, a))
+    return there.mean(-1) + forward / backward * back.mean(-1)
+
+
+@torch.no_grad()
+def farthest_points(
+    points: Float[Tensor, "*B N 3"], count: int, *, start: int = 0
+) -> Int[Tensor, "*B {count}"]:
+    """Indices of farthest-point sampling, beginning with point `start`.
+
+    Raises:
+        ValueError: The cloud has fewer than `count` points, or no point `start`.
+    """
+    if not 1 <= count <= points.shape[-2]:
+        raise ValueError(f"sampling: expected 1 to {points.shape[-2]} points, found {count}")
+    if not 0 <= start < points.shape[-2]:
+        raise ValueError(f"sampling: expected a start below {points.shape[-2]}, found {start}")
+    # On a CPU each of the many small steps would be compiled by itself, for minutes.
+    spread = uncompiled(_spread) if points.device.type == "cpu" else _spread
+    return spread(points, count, start)
+
+
+def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
+    chosen = torch.full(points.shape[:-2], start, device=points.device)
+    distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
+    indices = [chosen]
+    for _ in range(count - 1):
+        latest = gather(points, chosen[..., None])
+        distance = torch.minimum(distance, (points - latest).square().sum(-1))
+        chosen = distance.argmax(-1)
+        indices.append(chosen)
+    return torch.stack(indices, -1)
+
+
+MEAN_RADIUS = 0.25
+"""Mean distance of the points from their centroid after `normalise` (PROTOCOL 1.7): a length of 1
+is 4 times the mean radius of that cloud."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Similarity:
+    """normalised = (metric - centre) * scale."""
+
+    scale: Float[Tensor, "*B"]
+    centre: Float[Tensor, "*B 3"]
+
+    def forward(self, points: Float[Tensor, "*B K 3"]) -> Float[Tensor, "*B K 3"]:
+        """Metres to normalised units."""
+        return (points - self.centre[..., None, :]) * self.scale[..., None, None]
+
+    def inverse(self, points: Float[Tensor, "*B K 3"]) -> Float[Tensor, "*B K 3"]:
+        """Normalised units to metres."""
+        return points / self.scale[..., None, None] + self.centre[..., None, :]
+
+    def inverse_pose(self, pose: Float[Tensor, "*B P 4 4"]) -> Float[Tensor, "*B P 4 4"]:
+        """normalised_T_part, translations in normalised units, to metres about `centre`."""
+        out = pose.clone()
+        out[..., :3, 3] = self.inverse(pose[..., :3, 3])
+        return out
+
+
+def normalise(points: Float[Tensor, "*B N 3"]) -> tuple[Float[Tensor, "*B N 3"], Similarity]:
+    """Centre on the centroid and scale to mean radius 0.25.
+
+    Raises:
+        ValueError: All points of a cloud coincide, or a coordinate is not finite.
+    """
+    centre = points.mean(-2)
+    radius = (points - centre[..., None, :]).norm(dim=-1).mean(-1)
+    # Equal points a metre away have a radius of rounding error, not of 0.
+    rounding = 8 * torch.finfo(points.dtype).eps * centre.norm(dim=-1)
+    if not bool((torch.isfinite(radius) & (radius > rounding)).all()):
+        raise ValueError(
+            "cloud: expected finite points that differ, found mean radius "
+            f"{radius.flatten().tolist()[:8]} about {centre.reshape(-1, 3).tolist()[:8]}"
+        )
+    similarity = Similarity(scale=MEAN_RADIUS / radius, centre=centre)
+    return similarity.forward(points), similarity

@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: MIT
+"""SCAPO: canonicalise a cloud, explain it by an articulated template, read parts and joints off.
+
+Read this file first. Stage 1 (`canonicalise`) trains Theta_E and Theta_D to express every cloud in
+one canonical frame; stage 2 (`articulate`) trains keypoints, bones, joints and the template so
+that blend skinning carries the aligned cloud to the template and back. No label is used unless
+`supervision` asks for it. docs/method.md maps the paper's symbols to names here.
+
+Frames: `camera` in metres; `input`, the cloud centred and scaled to mean radius 0.25; `aligned`
+(S_obj); `canonical` (S*); `template` (Y_X).
+
+What OP-Align's released evaluator asks of a network (CONTRACT 3, `record_*`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from scapo.drawing import PictureData
+from scapo.geometry.points import Similarity, normalise
+from scapo.geometry.rigid import apply, rigid
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
+from scapo.paper import losses
+from scapo.paper.augment import random_pose
+from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig
+from scapo.paper.figures import articulated_pictures, canonical_pictures
+from scapo.paper.heads import (
+    HeadConfig,
+    JointConfig,
+    JointNetwork,
+    KeypointNetwork,
+    ResidualNetwork,
+    Template,
+    part_centroids,
+)
+from scapo.paper.objectives import Explanation, LossConfig, articulation, canonicalisation
+from scapo.paper.refine import refine
+from scapo.paper.skinning import Bones, cross_maps, part_maps
+from scapo.paper.vector_neurons import initialise
+from scapo.types import Category, JointKind, Joints, Labels, Observation, Prediction
+
+
+def opalign_record(e: Explanation) -> dict[str, Tensor]:
+    """What OP-Align's released evaluator asks of a network, under its names.
+
+    Aligned points are R_select^T x - T_select there; S is the aligned shape, I the template.
+    """
+    encoding = e.encoding
+    turned = (encoding.rotation.mT @ encoding.translation[..., None])[..., 0]
+    record = {"R_select": encoding.rotation, "T_select": turned}
+    for letter, joints in (("S", e.joints), ("I", e.template_joints)):
+        record |= {
+            f"{letter}_joint": joints.pivot,
+            f"{letter}_drct": joints.axis,
+            f"{letter}_angl": joints.state,
+        }
+    return record
+
+
+UNNAMED = frozenset({"preset", "supervision", "loss.without", "lr", "min_lr", "weight_decay"})
+"""Options with names of their own in a variant, or that make no other."""
+CANONICALISE = "canonicalise"
+ARTICULATE = "articulate"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScapoConfig:
+    """Everything that can be chosen; the defaults are the paper's values (Sec. 4)."""
+
+    preset: Literal["paper", "cpu"] = "paper"
+    """Where the other defaults come from."""
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    heads: HeadConfig = field(default_factory=HeadConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    gamma: float = 0.01
+    """Start of the skinning temperature, for a mean radius of 0.25."""
+    template_start: Literal["medoid", "random"] = "medoid"
+    """Y_base and K: the decoded medoid of the training codes, or random numbers."""
+    encoder_in_stage_2: Literal["joint", "frozen"] = "joint"
+    """joint: frozen for the first half, then a tenth of the rate."""
+    supervision: tuple[Literal["segmentation", "joint"], ...] = ()
+    """Labels that training may see: both in Table 2."""
+    epochs: tuple[int, ...] = (200, 200)
+    """Of each stage; one number for both."""
+    lr: tuple[float, float] = (1e-3, 1e-4)
+    min_lr: float = 1e-6
+    weight_decay: float = 1e-8
+    batch: int = 16
+
+
+def cpu_config() -> ScapoConfig:
+    """The lean preset: under 1.5 M parameters, a few edges at a few centres, one-sided terms."""
+    return ScapoConfig(
+        preset="cpu",
+        encoder=EncoderConfig(
+            neighbours=12, centres=64, width=16, branch=(32, 96, 64, 32), features=48
+        ),
+        decoder=DecoderConfig(patches=4, points=512, widths=(128, 64, 64)),
+        joint=JointConfig(width=48, blocks=3, head=(128, 64), points=256),
+        heads=HeadConfig(keypoint=(256, 128, 128), residual=(64, 64)),
+        loss=LossConfig(
+            recon_form="partial",
+            disturbances=("noise", "crop", "resample"),
+            disturbances_per_step=1,
+            state_gauge=10.0,
+            part_mass=10.0,
+            boundary_temperature=0.05,
+        ),
+        epochs=(16, 16),
+        lr=(2e-3, 1e-3),
+        batch=32,
+    )
+
+
+class Scapo(AbstractMethod):
+    """The method, for one category."""
+
+    name: ClassVar[str] = "scapo"
+    networks = ("encoder", "decoder", "joint_network", "keypoint_network", "residual_network")
+
+    def __init__(self, config: ScapoConfig, category: Category, generator: torch.Generator) -> None:
+        """Build the networks and draw their weights.
+
+        Args:
+            config: Sizes, losses, stages.
+            category: Fixes the number of parts and the kind of each joint, nothing else.
+            generator: On the CPU; the only source of the initial weights.
+        """
+        super().__init__()
+        self.config = config
+        self.category = category
+        self.supervision = frozenset(config.supervision)
+        self.kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
+        parts, code = len(category.parts), config.encoder.code
+        with torch.random.fork_rng(devices=[]):  # layers draw before `initialise` draws again
+            self.encoder = Encoder(config.encoder)
+            self.decoder = Decoder(config.decoder, code)
+            self.joint_network = JointNetwork(config.joint, category)
+            self.keypoint_network = KeypointNetwork(config.heads, code, parts)
+            self.residual_network = ResidualNetwork(config.heads, config.decoder.widths[-1])
+            self.template = Template(config.decoder.points, parts)
+            self.bones = Bones(parts, config.gamma)
+        initialise(self, generator)
+
+    @property
+    def variant(self) -> str:
+        """The preset, S and J for the labels used, other options, and the ablated terms."""
+        config = self.config
+        preset = ScapoConfig() if config.preset == "paper" else cpu_config()
+        words = [] if config.preset == "paper" else [config.preset]
+        words += ["".join(sorted((label[0].upper() for label in config.supervision), reverse=True))]
+        words += changes(config, preset, leave=UNNAMED)
+        words += [f"wo_{term}" for term in config.loss.without]
+        return "-".join(word for word in words if word)
+
+    def stages(self) -> tuple[Stage, ...]:
+        """Two stages of Adam with cosine annealing (Sec. 4)."""
+        config = self.config
+        epochs = config.epochs * 2 if len(config.epochs) == 1 else config.epochs
+        rates = [(1.0, 0.0)] * 5
+        modules = ["joint_network", "keypoint_network", "residual_network", "template", "bones"]
+        if config.encoder_in_stage_2 == "joint":
+            modules += ["encoder", "decoder"]
+            rates += [(0.1, 0.5)] * 2
+        groups = tuple(
+            ParameterGroup(module=module, rate=rate, begin=begin)
+            for module, (rate, begin) in zip(modules, rates, strict=True)
+        )
+        first = (ParameterGroup(module="encoder"), ParameterGroup(module="decoder"))
+        return tuple(
+            Stage(
+                name=name,
+                epochs=epochs,
+                lr=lr,
+                min_lr=config.min_lr,
+                weight_decay=config.weight_decay,
+                batch=config.batch,
+                parameters=parameters,
+            )
+            for name, epochs, lr, parameters in zip(
+                (CANONICALISE, ARTICULATE), epochs, config.lr, (first, groups), strict=True
+            )
+        )
+
+    @torch.no_grad()
+    def start(
+        self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> None:
+        """Before stage 2: put the decoded medoid of (at most 2,000) codes into the template."""
+        del labels
+        if stage != ARTICULATE or self.config.template_start == "random":
+            return
+        number = observation.points.shape[0]
+        chosen = torch.randperm(number, generator=generator, device=generator.device)[:2000]
+        self.eval()
+        codes = [
+            self.encoder(normalise(observation.points[some])[0]).code for some in chosen.split(64)
+        ]
+        code = torch.cat(codes)
+        medoid = torch.cdist(code, code).sum(1).argmin()
+        shape, _ = self.decoder(code[medoid, None])
+        keypoints = part_centroids(shape[0], len(self.category.parts))
+        self.template.set_to(shape[0], keypoints)
+        self.keypoint_network.start_at(keypoints)
+
+    def explain(self, points: Float[Tensor, "B N 3"]) -> Explanation:
+        """Run every network on clouds in the input frame."""
+        encoding = self.encoder(points)
+        _, features = self.decoder(encoding.code)
+        aligned = encoding.align(points)
+        residual = self.residual_network(features)
+        template = self.template.points + residual
+        keypoints = self.keypoint_network(encoding.code)
+        template_keypoints = self.template.keypoints.expand_as(keypoints)
+        joints, template_joints = self.joint_network.pair(aligned, template)
+        return Explanation(
+            encoding=encoding,
+            aligned=aligned,
+            template=template,
+            residual=residual,
+            keypoints=keypoints,
+            template_keypoints=template_keypoints,
+            joints=joints,
+            template_joints=template_joints,
+            weights=self.bones.weights(aligned, keypoints),
+            template_weights=self.bones.weights(template, template_keypoints),
+        )
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        """The terms of the stage for a batch in random poses, times their weights."""
+        points, similarity = normalise(observation.points)
+        config = self.config.loss
+        pose = random_pose(points.shape[0], config.shift, step.generator, points)
+        points = apply(pose, points)
+        if step.stage == CANONICALISE:
+            return canonicalisation(self.encoder, self.decoder, points, config, step.generator)
+        self._freeze(step)
+        explanation = self.explain(points)
+        terms = articulation(explanation, self.bones, self.kinds, config)
+        return terms | self._labelled(explanation, labels, similarity, pose)
+
+    def _freeze(self, step: Step) -> None:
+        """Stage 1's networks as they stand, batch statistics included, until they join."""
+        frozen = self.config.encoder_in_stage_2 == "frozen" or step.progress < 0.5
+        for network in (self.encoder, self.decoder):
+            network.train(not frozen)
+
+    def _labelled(
+        self,
+        explanation: Explanation,
+        labels: Labels,
+        similarity: Similarity,
+        pose: Float[Tensor, "B 4 4"],
+    ) -> dict[str, Tensor]:
+        """The supervised terms of Table 2's variant, in the input frame."""
+        config, terms = self.config.loss, {}
+        if labels.part is not None:
+            segmentation = losses.labelled_segmentation(explanation.weights, labels.part)
+            terms["labelled_segmentation"] = config.labelled_segmentation * segmentation
+        if labels.joints is not None:
+            encoding, joints = explanation.encoding, explanation.joints
+            pivot = apply(pose, similarity.forward(labels.joints.pivot))
+            axis = labels.joints.axis @ pose[:, :3, :3].mT
+            error = losses.labelled_joints(
+                encoding.place(joints.pivot), joints.axis @ encoding.rotation.mT, pivot, axis
+            )
+            terms["labelled_joints"] = config.labelled_joints * error
+        return terms
+
+    def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
+        """Canonicalised clouds, reconstructions; in stage 2 the template and the posed template."""
+        points, _ = normalise(observation.points)
+        explanation = self.explain(points)
+        if stage == CANONICALISE:
+            shape, _ = self.decoder(explanation.encoding.code)
+            return canonical_pictures(explanation, shape)
+        return articulated_pictures(explanation, self.bones, self.kinds)
+
+    @torch.no_grad()
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
+        """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (PROTOCOL 4.4).
+
+        The part frames are the template's: every part's pose carries the template onto the
+        cloud. States are those of the cloud minus the template's. `refine` moves pose and joints
+        of each cloud until the posed template fits it (not in the paper).
+        """
+        points, similarity = normalise(observation.points)
+        explanation = self.explain(points)
+        if mode == "refine":
+            explanation = refine(points, explanation, self.kinds)
+        encoding, joints = explanation.encoding, explanation.joints
+        maps = part_maps(cross_maps(explanation.template_joints, joints, self.kinds))
+        pose = rigid(encoding.rotation, encoding.translation)[:, None] @ maps
+        state = joints.relative() - explanation.template_joints.relative()
+        slide = torch.tensor([kind == "prismatic" for kind in self.kinds], device=state.device)
+        scale = similarity.scale[:, None]
+        return Prediction(
+            part_weight=explanation.weights,
+            camera_T_part=similarity.inverse_pose(pose),
+            joints=Joints(
+                pivot=similarity.inverse(encoding.place(joints.pivot)),
+                axis=joints.axis @ encoding.rotation.mT,
+                state=torch.where(slide, state / scale, state),
+            ),
+            canonical_points=explanation.template / scale[..., None],
+            record=opalign_record(explanation),
+        )

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""A placement of the template as a prediction in metres and the camera frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from scapo.geometry.points import Similarity, k_nearest
+from scapo.geometry.rigid import rigid
+from scapo.registered.bundle_adjustment import NORMAL_LENGTH
+from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, slides
+from scapo.registered.views import surface_normals
+from scapo.types import Joints, Prediction
+
+NEIGHBOURS = 12
+"""Template points that tell the part of an observed one."""
+REACH = 0.04
+"""Of their weights, normalised length; a unit of normal difference counts as `NORMAL_LENGTH`."""
+
+
+@torch.no_grad()
+def placed_prediction(
+    template: ArticulatedTemplate,
+    placement: Placement,
+    part_weight: Float[Tensor, "B N P"],
+    similarity: Similarity,
+    confidence: Float[Tensor, " B"],
+) -> Prediction:
+    """The prediction that a placement in normalised frames stands for.
+
+    States and part frames are those from the template's own state, or where hinges lean from their
+    rest, so that every part is its base moved by its joint.
+
+    Args:
+        template: The category's.
+        placement: Of each cloud.
+        part_weight: Of the points.
+        similarity: The normalisation to undo.
+        confidence: Handed on.
+    """
+    poses = _from_rest(template, placement)
+    origin = template.part_centres()[0] * placement.log_scale.exp()
+    move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
+    pivot, axis = template.joints_in_view(placement)
+    metric = placement.state / similarity.scale[:, None]
+    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state - template.rest)
+    return Prediction(
+        part_weight=part_weight,
+        camera_T_part=similarity.inverse_pose(rigid(poses.rotation, move)),
+        joints=Joints(pivot=similarity.inverse(pivot), axis=axis, state=state),
+        canonical_points=(canonical_points(template, placement) - origin[:, None])
+        / similarity.scale[:, None, None],
+        confidence=confidence,
+    )
+
+
+def _from_rest(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
+    """view_T_part with frames that all parts share with the base when hinges are at their rest."""
+    poses = template.part_poses(placement)
+    if not template.leans():
+        return poses
+    rested = template.part_poses(_at_rest(template, placement))
+    turn = poses.rotation @ rested.rotation.mT
+    gap = placement.translation[:, None] - rested.translation
+    return PartPoses(
+        rotation=turn @ placement.rotation[:, None],
+        translation=poses.translation + (turn @ gap[..., None])[..., 0],
+    )
+
+
+def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
+    """The placement with hinges that lean at their rest, others at the template's own state."""
+    return replace(placement, state=template.rest.expand_as(placement.state))
+
+
+@torch.no_grad()
+def canonical_points(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B M 3"]:
+    """The template in each cloud's size and the template's frame, in the state that counts as 0."""
+    still = replace(
+        _at_rest(template, placement),
+        rotation=torch.eye(3).to(placement.rotation).expand_as(placement.rotation),
+        translation=torch.zeros_like(placement.translation),
+    )
+    return template.place(still)[0]
+
+
+@torch.no_grad()
+def nearest_weights(
+    template: ArticulatedTemplate,
+    points: Float[Tensor, "B N 3"],
+    placement: Placement,
+    camera: Float[Tensor, "B 3"],
+) -> Float[Tensor, "B N P"]:
+    """Part weights of the placed template's points that are nearest in position and normal."""
+    normals = surface_normals(points, points, camera)
+    placed, placed_normals = template.place(placement)
+    source = torch.cat([points, NORMAL_LENGTH * normals], -1)
+    target = torch.cat([placed, NORMAL_LENGTH * placed_normals], -1)
+    weight = template.logit.softmax(-1)
+    return torch.stack(
+        [smoothed(one, other, weight) for one, other in zip(source, target, strict=True)]
+    )
+
+
+def smoothed(
+    source: Float[Tensor, "N D"], target: Float[Tensor, "M D"], values: Float[Tensor, "M P"]
+) -> Float[Tensor, "N P"]:
+    """Mean of the values at the nearest targets, a Gaussian of `REACH` beyond the nearest.
+
+    The labels of single template points are noisy where two parts meet.
+    """
+    index = k_nearest(source, target, min(NEIGHBOURS, len(target)))
+    off = (source[:, None] - target[index]).square().sum(-1)
+    share = torch.exp((off[:, :1] - off) / (2 * REACH**2))
+    share = share / share.sum(-1, keepdim=True)
+    return (share[..., None] * values[index]).sum(1)

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""Which part an observed point belongs to: the one whose motion the other views confirm.
+
+A point is carried by each part's motion into other views. Where they have the same surface there,
+that supports the part; where they saw empty space, it speaks against it. Points for which two
+motions fit alike (a wall that slides in itself) take the answer of the surface around them. From
+the answers of all views the template is built anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement
+from scapo.registered.views import Views, free_and_hidden
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """Of K points in each of B views, for each of P motions."""
+
+    points: Float[Tensor, "B K P 3"]
+    """Template frame, unposed by each part's motion."""
+    normals: Float[Tensor, "B K P 3"]
+    log_support: Float[Tensor, "B K P"]
+    """Logarithm of the share of the views that agree, of those that can tell."""
+    seen: Float[Tensor, "B K P"]
+    """Number of views that agree."""
+
+
+@torch.no_grad()
+def gather_evidence(
+    views: Views,
+    poses: PartPoses,
+    log_scale: Float[Tensor, "B 3"],
+    *,
+    count: int,
+    observers: Int[Tensor, " O"],
+) -> Evidence:
+    """Support of the first `count` points of every view from the `observers` among the views."""
+    scale = log_scale.exp()
+    columns = []
+    for p in range(poses.rotation.shape[1]):
+        turn, move = poses.rotation[:, p], poses.translation[:, p]
+        points = (views.points[:, :count] - move[:, None]) @ turn / scale[:, None]
+        normals = views.normals[:, :count] @ turn
+        agree, against = points.new_zeros(2, points.shape[0] * count).unbind(0)
+        own = torch.arange(len(points), device=points.device).repeat_interleave(count)
+        for o in observers.tolist():
+            there = points.flatten(0, 1) * scale[o] @ turn[o].T + move[o]
+            yes, no = _witness(
+                views.take(observers.new_tensor([o])), there, normals.flatten(0, 1) @ turn[o].T
+            )
+            agree = agree + yes * (own != o)
+            against = against + no * (own != o)
+        log_support = ((agree + 0.3) / (agree + against + 0.6)).log()
+        shape = points.shape[:2]
+        columns.append(
+            (points, normals, log_support.unflatten(0, shape), agree.unflatten(0, shape))
+        )
+    points, normals, log_support, seen = (torch.stack(c, 2) for c in zip(*columns, strict=True))
+    return Evidence(points=points, normals=normals, log_support=log_support, seen=seen)
+
+
+def _witness(
+    view: Views, points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"]
+) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+    """How far one view confirms oriented points, and how far it contradicts them, in [0, 1]."""
+    target, target_normals = view.points[0], view.normals[0]
+    off, index = (target.square().sum(-1) - 2 * points @ target.T).min(-1)
+    off = (off + points.square().sum(-1)).clamp_min(0)
+    same = (((normals * target_normals[index]).sum(-1) - 0.3) / 0.5).clamp(0, 1)
+    yes = torch.exp(-400.0 * off) * same
+    free, hidden = (mask[0] for mask in free_and_hidden(view, points[None], 0.03))
+    faces = (normals * F.normalize(view.camera - points, dim=-1)).sum(-1) > 0.3
+    missed = (~hidden & ~free & faces).to(yes)
+    return yes, (1 - yes) * (free.to(yes) + 0.5 * missed)
+
+
+@torch.no_grad()
+def spread(
+    views: Views, values: Float[Tensor, "B K C"], stiffness: float = 10.0
+) -> Float[Tensor, "B K C"]:
+    """Values smoothed over each view's surface: (I + stiffness L)^-1 values, L its Laplacian.
+
+    Neighbours count by distance and by how parallel their normals are, so that an answer spreads
+    along a face and stops at an edge.
+    """
+    count = values.shape[1]
+    points, normals = views.points[:, :count], views.normals[:, :count]
+    off = torch.cdist(points, points).square()
+    near = torch.exp(-off / (2 * 0.06**2) - 3 * (1 - normals @ normals.mT))
+    near = near / near.sum(-1).mean(-1)[:, None, None]
+    laplacian = torch.diag_embed(near.sum(-1)) - near
+    eye = torch.eye(count).to(values)
+    return torch.linalg.solve(eye + stiffness * laplacian, values)
+
+
+@torch.no_grad()
+def rebuild(
+    template: ArticulatedTemplate,
+    views: Views,
+    placement: Placement,
+    *,
+    poses: PartPoses | None = None,
+    generator: torch.Generator,
+    observers: int = 24,
+) -> None:
+    """Build the template's points and part weights anew from all views at their placements.
+
+    Args:
+        template: Changed in place.
+        views: B views.
+        placement: Theirs.
+        poses: Of the parts, if they are not as placed.
+        generator: Draws the observers.
+        observers: Views that are asked about the points of the others.
+    """
+    count = max(40, min(views.points.shape[1], 6000 // len(views.points)))
+    order = torch.randperm(len(views.points), generator=generator, device=generator.device)
+    evidence = gather_evidence(
+        views,
+        template.part_poses(placement) if poses is None else poses,
+        placement.log_scale,
+        count=count,
+        observers=order[:observers],
+    )
+    score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
+    score[..., 0] += 0.1  # what nothing tells apart stays with the base
+    score = spread(views, score)
+    part = score.argmax(-1)
+    chosen = part[..., None, None].expand(*part.shape, 1, 3)
+    points = evidence.points.gather(2, chosen)[:, :, 0].flatten(0, 1)
+    normals = evidence.normals.gather(2, chosen)[:, :, 0].flatten(0, 1)
+    support = evidence.log_support.gather(2, part[..., None])[..., 0].flatten().exp()
+    seen = evidence.seen.gather(2, part[..., None])[..., 0].flatten()
+    good = (support > 0.4) & (seen > max(1.0, 0.05 * min(observers, len(order))))
+    _resample(template, points, normals, score.flatten(0, 1), support, good)
+
+
+def _resample(
+    template: ArticulatedTemplate,
+    points: Float[Tensor, "C 3"],
+    normals: Float[Tensor, "C 3"],
+    score: Float[Tensor, "C P"],
+    support: Float[Tensor, " C"],
+    good: Bool[Tensor, " C"],
+) -> None:
+    """Spread-out points among the good ones, each averaged with those about it."""
+    if int(good.sum()) < 50:
+        return
+    points, normals, score, support = points[good], normals[good], score[good], support[good]
+    part = F.one_hot(score.argmax(-1), score.shape[1]).to(points)
+    feature = surface_features(points, normals, part)
+    index = farthest_features(feature, min(len(template.points), len(points)))
+    off = torch.cdist(feature[index], feature).square()
+    weight = torch.exp(-off / (2 * 0.03**2)) * support
+    weight = weight / weight.sum(-1, keepdim=True)
+    logit = 6 * weight @ score
+    template.assign(weight @ points, F.normalize(weight @ normals, dim=-1), logit)
+
+
+def surface_features(
+    points: Float[Tensor, "C 3"], normals: Float[Tensor, "C 3"], part: Float[Tensor, "C P"]
+) -> Float[Tensor, "C D"]:
+    """Features whose distance tells points apart by place, normal (0.06) and part (0.1)."""
+    return torch.cat([points, 0.06 * normals, 0.1 * part], -1)
+
+
+def farthest_features(feature: Float[Tensor, "C D"], count: int) -> Int[Tensor, " {count}"]:
+    """Farthest-point sampling in a feature space."""
+    distance = torch.full_like(feature[:, 0], torch.inf)
+    index = [0]
+    for _ in range(count - 1):
+        distance = torch.minimum(distance, (feature - feature[index[-1]]).square().sum(-1))
+        index.append(int(distance.argmax()))
+    return torch.tensor(index, device=feature.device)

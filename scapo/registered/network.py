@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""A small network in which points vote for the pose, exactly equivariant by principal frames.
+
+A cloud is expressed in the four proper frames of its principal axes: the set of four does not
+change when the cloud is turned or moved. In each frame a plain point network says where every
+point lies on the placed template (template axes, this cloud's size and state), how sure it is,
+and which part it belongs to; a weighted Procrustes step turns the votes into a pose. The frame
+whose points are surest wins. Learned towards the placements that search and joint fit found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from scapo.geometry.points import k_nearest
+from scapo.geometry.rigid import project_rotation
+
+SIGNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
+"""Flips of the principal axes that keep the frame right-handed."""
+CAMERA_UNIT = 4.0
+"""Camera positions are learned in this many normalised units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Votes:
+    """What the network says of B clouds of K points in the frames it was given."""
+
+    points: Float[Tensor, "B K 3"]
+    """Each point on the placed template: template_R_view (x - t)."""
+    sureness: Float[Tensor, "B K"]
+    """Logit: whether the vote is good."""
+    part: Float[Tensor, "B K P"]
+    """Logits."""
+    state: Float[Tensor, "B J"]
+    log_scale: Float[Tensor, "B 3"]
+    shift: Float[Tensor, "B J 3"]
+    camera: Float[Tensor, "B 3"]
+    """The camera's centre in the template frame."""
+
+
+class PointVotes(nn.Module):
+    """Edge features of neighbours, a point network with a global code, heads for the votes."""
+
+    def __init__(self, parts: int, joints: int, *, width: int = 48, neighbours: int = 12) -> None:
+        super().__init__()
+        self.joints, self.neighbours = joints, neighbours
+        w = width
+        self.edge = nn.Sequential(nn.Linear(9, w), nn.ReLU(), nn.Linear(w, w))
+        self.local = _block(w + 3, 2 * w)
+        self.wide = _block(2 * w, 4 * w)
+        self.code = _block(8 * w, 4 * w)
+        self.mix = nn.Sequential(_block(w + 2 * w + 4 * w, 4 * w), _block(4 * w, 3 * w))
+        self.vote = nn.Linear(3 * w, 3 + 1 + parts)
+        self.whole = nn.Sequential(_block(4 * w, 2 * w), nn.Linear(2 * w, joints * 4 + 6))
+
+    def forward(self, points: Float[Tensor, "B K 3"]) -> Votes:
+        """Votes for clouds of mean radius 0.25 in their principal frames."""
+        index = k_nearest(points, points, self.neighbours)
+        near = points.gather(1, index.flatten(1)[..., None].expand(-1, -1, 3))
+        step = 8 * (near.unflatten(1, index.shape[1:]) - points[:, :, None])
+        here = (4 * points)[:, :, None].expand_as(step)
+        edge = self.edge(torch.cat([step, here, step.square()], -1)).amax(2)  # (B, K, w)
+        local = self.local(torch.cat([edge, 4 * points], -1))  # (B, K, 2w)
+        wide = self.wide(local)
+        code = self.code(torch.cat([wide.amax(1), wide.mean(1)], -1))  # (B, 4w)
+        spread = code[:, None].expand(-1, points.shape[1], -1)
+        vote = self.vote(self.mix(torch.cat([edge, local, spread], -1)))
+        whole = self.whole(code)
+        j = self.joints
+        return Votes(
+            points=vote[..., :3],
+            sureness=vote[..., 3],
+            part=vote[..., 4:],
+            state=whole[:, :j],
+            log_scale=whole[:, j : j + 3],
+            shift=whole[:, j + 3 : 4 * j + 3].unflatten(1, (j, 3)),
+            camera=CAMERA_UNIT * whole[:, 4 * j + 3 :],
+        )
+
+
+def _block(inputs: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, outputs), nn.LayerNorm(outputs), nn.ReLU())
+
+
+def principal_frames(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 4 3 3"]:
+    """The four right-handed frames of each centred cloud's principal axes (rows, longest first)."""
+    _, vectors = torch.linalg.eigh(points.mT @ points)
+    frame = vectors.flip(-1).mT
+    frame = frame * torch.linalg.det(frame).sign()[:, None, None]
+    signs = torch.tensor(SIGNS).to(points)
+    return signs[:, :, None] * frame[:, None]
+
+
+def procrustes(
+    target: Float[Tensor, "B K 3"], source: Float[Tensor, "B K 3"], weight: Float[Tensor, "B K"]
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
+    """Rotation R and translation t with target = R source + t, weighted least squares."""
+    weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-9))[..., None]
+    target_mean = (weight * target).sum(1)
+    source_mean = (weight * source).sum(1)
+    cross = ((target - target_mean[:, None]) * weight).mT @ (source - source_mean[:, None])
+    rotation = project_rotation(cross)
+    return rotation, target_mean - (rotation @ source_mean[..., None])[..., 0]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """What the votes should be, for B clouds."""
+
+    points: Float[Tensor, "B K 3"]
+    part: Float[Tensor, "B K P"]
+    """Weights."""
+    state: Float[Tensor, "B J"]
+    log_scale: Float[Tensor, "B 3"]
+    shift: Float[Tensor, "B J 3"]
+    camera: Float[Tensor, "B 3"]
+    trust: Float[Tensor, " B"]
+    """Weight of each cloud, in [0, 1]."""
+
+
+def vote_losses(votes: Votes, target: Target) -> dict[str, Tensor]:
+    """Distance of the votes (not squared: some targets are wrong), sureness, parts and the rest."""
+    off = (votes.points - target.points).square().sum(-1)
+    trust = target.trust / target.trust.sum().clamp_min(1e-6)
+    good = torch.exp(-off.detach() / (2 * 0.06**2))
+    sure = F.binary_cross_entropy_with_logits(votes.sureness, good, reduction="none").mean(1)
+    part = -(target.part * votes.part.log_softmax(-1)).sum(-1).mean(1)
+    state = (votes.state - target.state).abs().mean(1)
+    size = (votes.log_scale - target.log_scale).abs().mean(1)
+    size = size + (votes.shift - target.shift).abs().mean((1, 2))
+    camera = (votes.camera - target.camera).abs().mean(1) / CAMERA_UNIT
+    terms = {
+        "votes": (off + 1e-6).sqrt().mean(1),
+        "sureness": 0.05 * sure,
+        "part": 0.03 * part,
+        "state": 0.1 * state,
+        "size": 0.05 * size,
+        "camera": 0.2 * camera,
+    }
+    return {name: (trust * value).sum() for name, value in terms.items()}

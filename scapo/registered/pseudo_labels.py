@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""The placements that search found for the training clouds, as the network's targets."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from scapo.registered.template import Placement
+
+
+class PseudoPlacements(nn.Module):
+    """Placements of training clouds as found, looked up by a cloud's first point."""
+
+    key: Tensor
+    rotation: Tensor
+    translation: Tensor
+    log_scale: Tensor
+    state: Tensor
+    shift: Tensor
+    camera: Tensor
+    """Centres in the template frame."""
+    trust: Tensor
+    """Weight of each when the network learns."""
+    belonging: Tensor
+    """Which points of each cloud belong to the object (bool)."""
+    NAMES: ClassVar[tuple[str, ...]] = (
+        "key",
+        "rotation",
+        "translation",
+        "log_scale",
+        "state",
+        "shift",
+        "camera",
+        "trust",
+    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in self.NAMES:
+            self.register_buffer(name, torch.zeros(0))
+        self.register_buffer("belonging", torch.ones(0, 0, dtype=torch.bool))
+
+    def set(self, key: Tensor, placement: Placement, camera: Tensor, trust: Tensor) -> None:
+        """Replace all."""
+        values = (
+            key,
+            placement.rotation,
+            placement.translation,
+            placement.log_scale,
+            placement.state,
+            placement.shift,
+            camera,
+            trust,
+        )
+        for name, value in zip(self.NAMES, values, strict=True):
+            setattr(self, name, value.detach().clone())
+
+    def placement(self) -> Placement:
+        """All of them, their hinges straight."""
+        names = self.NAMES[1:6]
+        values = {name: getattr(self, name) for name in names}
+        return Placement(**values, lean=torch.zeros_like(self.shift))
+
+    def find(self, first: Float[Tensor, "B 3"]) -> Int[Tensor, " B"]:
+        """Row of each cloud, by its first point.
+
+        Raises:
+            ValueError: A cloud that is not there.
+        """
+        gap = (first[:, None] - self.key).abs().sum(-1)
+        if bool((gap.amin(1) > 0).any()):
+            raise ValueError("expected clouds whose placements were found, found others")
+        return gap.argmin(1)
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        *rest: Any,  # noqa: ANN401 - as torch calls it
+        **named: Any,  # noqa: ANN401
+    ) -> None:
+        """Take the size of what is loaded."""
+        for name in (*self.NAMES, "belonging"):
+            if prefix + name in state_dict:
+                empty = torch.zeros_like(state_dict[prefix + name], device=self.key.device)
+                setattr(self, name, empty)
+        super()._load_from_state_dict(state_dict, prefix, *rest, **named)

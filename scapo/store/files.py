@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""One safetensors file: arrays and a header, written atomically, the same input to the same bytes.
+
+The header is ONE metadata entry, `scapo`, holding sorted JSON: several entries are written in
+random order, which would break byte identity.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from scapo.store.schema import StoreError
+
+SAMPLES = "scapo-samples/1"
+PREDICTIONS = "scapo-predictions/1"
+CHECKPOINT = "scapo-checkpoint/1"
+
+Arrays = dict[str, np.ndarray]
+Header = dict[str, Any]
+
+
+def canonical_json(value: object) -> str:
+    """Sorted, compact JSON: equal values give equal text."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def sha256_bytes(data: bytes) -> str:
+    """SHA-256 in hex."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_file(path: Path) -> str:
+    """SHA-256 of a file's bytes in hex, read in pieces."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while piece := file.read(1 << 20):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def write_bytes(path: Path | str, data: bytes) -> None:
+    """Write through a temporary name in the same folder, flushed to disk before the rename."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        with suppress(OSError):  # usually gone; else the first error is the one to report
+            temporary.unlink()
+
+
+def write(path: Path | str, arrays: Mapping[str, np.ndarray], header: Header) -> str:
+    """Write arrays and header atomically; the same input gives the same bytes.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = write(f"{folder}/a.safetensors", {"x": np.eye(2)}, {"format": "mine/1"})
+    ...     arrays, header = read(f"{folder}/a.safetensors", "mine/1")
+    >>> arrays["x"].tolist(), header
+    ([[1.0, 0.0], [0.0, 1.0]], {'format': 'mine/1'})
+
+    Returns:
+        The SHA-256 of the file.
+
+    Raises:
+        StoreError: A header that is not JSON, or an array of a type that the format lacks.
+    """
+    # Not ascontiguousarray, which makes vectors of scalars.
+    ordered = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    if "__metadata__" in ordered:
+        raise StoreError(f"{path}: expected a tensor name, found '__metadata__', the header's own")
+    try:
+        entry = canonical_json(header)
+    except (TypeError, ValueError) as error:
+        raise StoreError(f"{path}: expected a header of JSON values, found {error}") from error
+    try:
+        data = save(ordered, metadata={"scapo": entry})
+    except SafetensorError as error:
+        kinds = ", ".join(f"{name} {array.dtype}" for name, array in ordered.items())
+        raise StoreError(f"{path}: expected numbers or bools, found {kinds}: {error}") from error
+    write_bytes(path, data)
+    return sha256_bytes(data)
+
+
+def _open(path: Path) -> Any:  # noqa: ANN401 - safetensors ships no types
+    return safe_open(path, "numpy")
+
+
+def read_header(path: Path | str, expected: str | None = None) -> Header:
+    """The header alone.
+
+    Args:
+        path: A safetensors file.
+        expected: The header's `format`, None for any.
+
+    Raises:
+        StoreError: No such file, not safetensors, no `scapo` entry, or another format.
+    """
+    path = Path(path)
+    if not path.is_file():
+        found = "a folder" if path.is_dir() else "none"
+        raise StoreError(f"{path}: expected a file, found {found}")
+    try:
+        with _open(path) as file:
+            metadata: dict[str, str] = file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise StoreError(f"{path}: expected a safetensors file, found {error}") from error
+    if "scapo" not in metadata:
+        raise StoreError(
+            f"{path}: expected the metadata entry 'scapo', found {sorted(metadata) or 'none'}"
+        )
+    try:
+        header: object = json.loads(metadata["scapo"])
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path}: expected JSON in the header, found {error}") from error
+    if not isinstance(header, dict):
+        raise StoreError(f"{path}: expected a JSON object, found {type(header).__name__}")
+    fields = cast("Header", header)
+    if expected is not None and fields.get("format") != expected:
+        raise StoreError(f"{path}: expected format {expected!r}, found {fields.get('format')!r}")
+    return fields
+
+
+def read(
+    path: Path | str, expected: str | None = None, names: tuple[str, ...] | None = None
+) -> tuple[Arrays, Header]:
+    """Arrays (all, or those of `names` that are there) and header.
+
+    Raises:
+        StoreError: As `read_header`, or a tensor cannot be read as numpy.
+    """
+    header = read_header(path, expected)
+    arrays: Arrays = {}
+    try:
+        with _open(Path(path)) as file:
+            for name in file.keys():  # noqa: SIM118 - the file is no mapping
+                if names is None or name in names:
+                    arrays[name] = file.get_tensor(name)
+    except (SafetensorError, TypeError, AttributeError, OSError) as error:
+        raise StoreError(f"{path}: expected numpy-readable tensors, found {error}") from error
+    return arrays, header
+
+
+def require(path: Path, names: Iterable[str], there: Iterable[str]) -> None:
+    """Refuse a file without one of the tensors `names`.
+
+    Raises:
+        StoreError: Naming file and tensor.
+    """
+    missing = [name for name in names if name not in set(there)]
+    if missing:
+        raise StoreError(f"{path}: expected tensor {missing[0]!r}, found none")

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""A folder of files that appears whole, and replaces only what this program wrote itself.
+
+`.made.json` in the folder names its files with their SHA-256. A folder without it, or in which a
+file was added, changed or taken away since, is somebody's work: it is refused and left alone.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+from scapo.store.files import canonical_json, sha256_file
+
+MADE = ".made.json"
+FORMAT = "scapo-folder/1"
+OURS = "what this program wrote"
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder that gets the name `folder` at the end, unless an error is raised.
+
+    Raises:
+        ValueError: Something is in the way that is not `made_here`.
+    """
+    refuse_foreign(folder, made_here)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        temporary.chmod(0o755)
+        yield temporary
+        record = {"format": FORMAT, "files": digests(temporary)}
+        (temporary / MADE).write_text(canonical_json(record) + "\n", encoding="utf-8")
+        swap(temporary, folder, made_here)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def swap(temporary: Path, folder: Path, known: Callable[[Path], bool], what: str = OURS) -> None:
+    """Give a finished folder its name; what is there is moved aside first, then removed.
+
+    Raises:
+        ValueError: As `refuse_foreign`.
+    """
+    refuse_foreign(folder, known, what)
+    old = temporary.with_name(f"{temporary.name}.old")
+    if folder.exists():
+        folder.replace(old)
+    temporary.replace(folder)
+    if old.exists():
+        shutil.rmtree(old)
+
+
+def refuse_foreign(folder: Path, known: Callable[[Path], bool], what: str = OURS) -> None:
+    """Refuse a target that is a link, a file, or a folder that `known` denies, empty ones apart.
+
+    Raises:
+        ValueError: Naming folder, `what` may be there and what was found.
+    """
+    if folder.is_symlink():
+        found = "a link"
+    elif not folder.exists():
+        return
+    elif not folder.is_dir():
+        found = "a file"
+    elif not any(folder.iterdir()) or known(folder):
+        return
+    else:
+        found = "a folder with other files, or with files that were changed; it is left alone"
+    raise ValueError(f"{folder}: expected nothing, or {what}, found {found}")
+
+
+def made_here(folder: Path) -> bool:
+    """Whether `whole_folder` wrote this folder and nothing in it has changed since."""
+    marker = folder / MADE
+    if marker.is_symlink() or not marker.is_file():
+        return False
+    try:
+        record: object = json.loads(marker.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    if not isinstance(record, dict):
+        return False
+    fields = cast("dict[str, object]", record)
+    return fields.get("format") == FORMAT and fields.get("files") == digests(folder)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file below a folder but the marker's; "" for what is neither file nor folder.
+
+    Empty folders count too, as names that end in "/".
+    """
+    found: dict[str, str] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if name == MADE:
+            continue
+        if path.is_symlink() or not (path.is_file() or path.is_dir()):
+            found[name] = ""
+        elif path.is_file():
+            found[name] = sha256_file(path)
+        elif not any(path.iterdir()):
+            found[f"{name}/"] = ""
+    return found

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""Samples, predictions and checkpoints on disk; what is read is validated here.
+
+Layout: `DIR/<category>/<split>/manifest.json` and shards beside it (CONTRACT 3). One file is
+written and read by `write` and `read` (of `files`), a split through `open_split` and `dataset`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from scapo.store.files import (
+    SAMPLES,
+    Arrays,
+    Header,
+    read,
+    require,
+    sha256_file,
+)
+from scapo.store.manifest import Manifest, ManifestError, read_manifest
+from scapo.store.schema import LAYOUT, StoreError, check_samples, sample_shapes
+
+
+class Split:
+    """One split of one category on disk, read shard by shard."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read the manifest of `folder`.
+
+        Raises:
+            StoreError: There is no manifest there, or it is not valid.
+        """
+        self.folder = folder
+        try:
+            self.manifest: Manifest = read_manifest(folder / "manifest.json")
+        except ManifestError as error:
+            raise StoreError(str(error)) from error
+
+    def shards(self, names: tuple[str, ...] | None = None) -> Iterator[Arrays]:
+        """Arrays of each shard in order, checked against the manifest and CONTRACT 3.
+
+        Raises:
+            StoreError: A shard is missing, of another split, size or shape, or holds values that
+                cannot be, such as an axis that is no unit vector.
+        """
+        for shard in self.manifest.shards:
+            path = self.folder / shard.file
+            arrays, header = read(path, SAMPLES, names)
+            self.check_header(path, header)
+            check_samples(path, arrays, self.manifest, shard.first, shard.count)
+            yield arrays
+
+    def arrays(self, *names: str) -> Arrays:
+        """The named tensors of the whole split, in memory."""
+        shapes = self.shapes(0)
+        parts: list[Arrays] = (
+            [{name: np.zeros(shapes[name], LAYOUT[name][0]) for name in names if name in shapes}]
+            if not self.manifest.shards
+            else []
+        )
+        for shard, arrays in zip(self.manifest.shards, self.shards(names), strict=True):
+            require(self.folder / shard.file, names, arrays)
+            parts.append(arrays)
+        return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+    def shapes(self, count: int) -> dict[str, tuple[int, ...]]:
+        """Expected shape of each sample tensor for `count` samples (CONTRACT 3)."""
+        return sample_shapes(self.manifest, count)
+
+    def check_header(self, path: Path, header: Header) -> None:
+        """Refuse a shard that says it belongs to another category or split.
+
+        Raises:
+            StoreError: Naming file, field, expected and found value.
+        """
+        for field in ("category", "split"):
+            want = getattr(self.manifest, field)
+            if header.get(field, want) != want:
+                raise StoreError(f"{path}: {field}: expected {want!r}, found {header[field]!r}")
+
+    def verify(self) -> None:
+        """Compare every shard's bytes with the manifest.
+
+        Raises:
+            StoreError: A shard is missing or its SHA-256 differs.
+        """
+        for shard in self.manifest.shards:
+            path = self.folder / shard.file
+            if not path.is_file():
+                raise StoreError(f"{path}: expected a shard of the manifest, found none")
+            found = sha256_file(path)
+            if found != shard.sha256:
+                raise StoreError(f"{path}: expected sha256 {shard.sha256}, found {found}")
+
+
+def find_split(folder: Path | str, category: str | None, split: str) -> Path:
+    """The split's folder below `folder`, which may be the data set, the category or the split.
+
+    Looked for in this order: `folder` itself, `folder/split`, `folder/category/split`, and
+    `folder/*/category/split` (a benchmark adds its name above the category).
+
+    Raises:
+        StoreError: Nothing there, or more than one.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "none"
+        raise StoreError(f"{folder}: expected a folder of samples, found {found}")
+
+    def named(top: Path) -> list[Path]:
+        return [top / category] if category else _folders(top)
+
+    places = ([folder], [folder / split], [path / split for path in named(folder)])
+    deep = (path / split for top in _folders(folder) for path in named(top))
+    wanted = f"{category or '*'}/{split}"
+    for paths in (*places, deep):
+        found = [path for path in paths if _is_split(path, category, split)]
+        if len(found) > 1:
+            names = ", ".join(str(path.relative_to(folder)) for path in found)
+            raise StoreError(f"{folder}: expected one {wanted}, found {names}")
+        if found:
+            return found[0]
+    there = [path for depth in range(4) for path in folder.glob("*/" * depth + "manifest.json")]
+    names = ", ".join(sorted(str(path.parent.relative_to(folder)) for path in there)[:20])
+    raise StoreError(f"{folder}: expected {wanted}/manifest.json, found {names or 'none'}")
+
+
+def _folders(path: Path) -> list[Path]:
+    with suppress(OSError):
+        return sorted(child for child in path.iterdir() if child.is_dir())
+    return []
+
+
+def _is_split(folder: Path, category: str | None, split: str) -> bool:
+    path = folder / "manifest.json"
+    if not path.is_file():
+        return False
+    try:
+        data: object = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return folder.name == split
+    if not isinstance(data, dict):
+        return folder.name == split  # so that opening it says what is wrong
+    fields = cast("dict[str, object]", data)
+    return fields.get("split") == split and category in (None, fields.get("category"))
+
+
+def open_split(folder: Path | str, category: str | None = None, split: str = "train") -> Split:
+    """Find and open a split; see `find_split`."""
+    return Split(find_split(Path(folder), category, split))

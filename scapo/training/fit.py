@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: MIT
+"""The training loop, for any method: stages, batches, log, checkpoint, resume, stop at NaN.
+
+All data lie on the device, batches are drawn by index there, randomness comes from two generators
+of one seed (order of the data on the host, augmentation on the device). A run that was killed
+continues from its last checkpoint with the same batches: on a CPU, bit for bit the same curve.
+
+Where the process belongs to a group (`ranks`, torchrun), each rank takes its share of every
+batch, gradients are summed, and the first rank alone starts stages, writes and logs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.numpy import load, save
+from torch import Tensor
+
+from scapo.method import AbstractMethod, Stage, Step, evenly
+from scapo.store import checkpoint
+from scapo.store.files import Arrays
+from scapo.store.samples import TrainingData
+from scapo.store.schema import StoreError
+from scapo.training import precision
+from scapo.training.distributed import average_buffers, present
+from scapo.training.log import BAD_BATCH, Log, draw_progress, save_batch
+from scapo.training.optimiser import Descent, NotFiniteError, adam, schedule
+from scapo.training.precision import Arithmetic
+from scapo.training.run_folder import Position, RunFolder, State, kept
+
+
+class TrainingError(ArithmeticError):
+    """The loss or its gradient is not finite; the message names the file with the batch."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitConfig:
+    """How a run is driven; nothing here is a property of the method."""
+
+    seed: int = 1
+    device: str = "cpu"
+    log_every: int = 10
+    """Steps between two lines of metrics.jsonl, which hold means over them."""
+    checkpoint_every: float = 60.0
+    """Seconds after which the end of an epoch saves the state."""
+    clip: float = 10.0
+    """Largest norm of the gradient; longer ones are scaled down."""
+    arithmetic: Arithmetic = field(default_factory=Arithmetic)
+    """Precision and compilation of the networks."""
+    pictures_every: float | None = 300.0
+    """Seconds after which the end of an epoch draws the method's pictures, as does the end of a
+    stage; None: never."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """What a listener hears after each step."""
+
+    stage: Stage
+    epoch: int
+    done: float
+    """Share of the stage."""
+    loss: float | None
+    """Mean of the last lines of the log; None between them."""
+
+
+Listener = Callable[[Progress], None]
+
+
+def silent(progress: Progress) -> None:
+    """A listener that does nothing."""
+    del progress
+
+
+def fit(
+    method: AbstractMethod,
+    data: TrainingData,
+    folder: Path,
+    config: FitConfig,
+    *,
+    resume: bool = False,
+    listener: Listener = silent,
+) -> None:
+    """Run all stages of a method and leave the run in `folder`.
+
+    Writes config.json, metrics.jsonl, tensorboard/ (where that package is installed), pictures/
+    (where matplotlib is), checkpoint.safetensors and training.safetensors. With `resume` a run in
+    that folder is continued, or left as it is when it was finished.
+
+    Raises:
+        TrainingError: The loss or its gradient is not finite.
+        StoreError: `resume` with another configuration or other data, or a run is there without
+            `resume`; or the folder cannot be written, what was saved before is whole.
+        ValueError: Fewer samples in a batch than ranks, or a precision that the method lacks.
+    """
+    Trainer(method, data, folder, config, listener).run(resume=resume)
+
+
+class Trainer:
+    """One run: what `fit` needs at hand from step to step."""
+
+    def __init__(
+        self,
+        method: AbstractMethod,
+        data: TrainingData,
+        folder: Path,
+        config: FitConfig,
+        listener: Listener,
+    ) -> None:
+        """Move method and data to the device."""
+        self.method = method.to(config.device)
+        allowed = data.labels.keep(method.supervision)
+        self.data = TrainingData(
+            observation=data.observation, labels=allowed, digest=data.digest
+        ).to(config.device)
+        self.config, self.listener, self.ranks = config, listener, present()
+        seed = config.seed + (self.ranks.rank << 32)  # every rank augments in its own way
+        self.state = State(
+            position=Position(),
+            order=torch.Generator().manual_seed(config.seed),
+            noise=torch.Generator(config.device).manual_seed(seed),
+        )
+        self.folder = RunFolder(folder, method, self._about(), config.device)
+        self.descent = Descent(
+            method=method,
+            clip=config.clip,
+            arithmetic=config.arithmetic,
+            device=config.device,
+            ranks=self.ranks,
+            scaler=precision.scaler(config.arithmetic.precision, config.device),
+        )
+        self.saved = self.drawn = time.monotonic()
+
+    def _about(self) -> dict[str, Any]:
+        training = {**asdict(self.config.arithmetic), "clip": self.config.clip}
+        return {
+            "seed": self.config.seed,
+            "data_digest": self.data.digest,
+            "training": {**training, "ranks": self.ranks.count},
+        }
+
+    def run(self, *, resume: bool) -> None:
+        """All stages that are left."""
+        finished, moments = False, None
+        with self._explained():
+            if self.folder.found(resume=resume):
+                finished, moments = self.folder.load(self.state, self.ranks.rank)
+            elif self.ranks.first:
+                self.folder.begin()
+            if finished:
+                return
+            self.ranks.wait()  # no rank looks for a run that another has begun
+            path = self.folder.path if self.ranks.first else None
+            self.log = Log(path, self.state.position.step, self.ranks.total)
+            with (
+                contextlib.closing(self.log),
+                precision.applied(self.method, self.config.arithmetic, self.config.device),
+            ):
+                self._stages(moments)
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        """A full disk or a folder that cannot be written, as one line with what is left."""
+        try:
+            yield
+        except OSError as error:
+            raise StoreError(
+                f"{self.folder.path}: expected a folder that can be written, found "
+                f"{error.strerror or error}; {kept(self.folder.path)}"
+            ) from error
+
+    def _stages(self, moments: Arrays | None) -> None:
+        position, stages = self.state.position, self.method.stages()
+        if moments is not None and position.scaler:
+            self.descent.scaler.load_state_dict(position.scaler)
+        if not stages:
+            self._start(Stage(name="", epochs=0, lr=0.0))
+        while position.stage < len(stages):
+            stage = stages[position.stage]
+            if not position.started:
+                self._start(stage)
+            optimizer = adam(self.method, stage)
+            if moments is not None:
+                checkpoint.load_adam(optimizer, moments)
+                moments = None
+            self._stage(stage, optimizer)
+            position.stage, position.epoch, position.started = position.stage + 1, 0, False
+            self._draw(stage)
+            self._save(None)
+        self._save(None, finished=True)
+
+    def _start(self, stage: Stage) -> None:
+        """The method's start of a stage, by the first rank for all; saved, as it may take long."""
+        began = time.monotonic()
+        if self.ranks.first:
+            observation, labels = self.data.observation, self.data.labels
+            self.method.start(stage.name, observation, labels, self.state.noise)
+        if self.ranks.count > 1:
+            state = save(checkpoint.to_arrays(self.method)) if self.ranks.first else b""
+            arrays = load(self.ranks.from_first(state, self.config.device))
+            checkpoint.load_arrays(self.method, arrays, self.folder.path)
+        self.state.position.spend(stage.name, time.monotonic() - began)
+        self.state.position.started = True
+        if stage.epochs:
+            self._save(None)
+
+    def _stage(self, stage: Stage, optimizer: torch.optim.Adam) -> None:
+        """The epochs of a stage that are left."""
+        position = self.state.position
+        used = evenly(self.data.observation.points.shape[0], stage.clouds)
+        samples = len(used)
+        size = min(stage.batch, samples)
+        if size < self.ranks.count:
+            raise ValueError(
+                f"batch: expected a sample for each of {self.ranks.count} ranks, found {size}"
+            )
+        steps = samples // size
+        for epoch in range(position.epoch, stage.epochs):
+            began = time.monotonic()
+            self.method.train()
+            order = used[torch.randperm(samples, generator=self.state.order)[: steps * size]]
+            for number, index in enumerate(order.split(size)):
+                done = (epoch * steps + number) / (stage.epochs * steps)
+                self._step(stage, optimizer, index, done)
+                self.listener(Progress(stage=stage, epoch=epoch, done=done, loss=self.log.latest))
+            self.log.write(position.step, stage.name)
+            average_buffers(self.method, self.ranks)
+            position.epoch = epoch + 1
+            seconds = time.monotonic() - began
+            position.spend(stage.name, seconds)
+            position.rates[stage.name] = steps * size / seconds
+            self.log.scalar("samples_per_second", steps * size / seconds, position.step)
+            if self._due(self.saved, self.config.checkpoint_every):
+                self._save(optimizer)
+            every = self.config.pictures_every
+            if every is not None and self._due(self.drawn, every) and epoch + 1 < stage.epochs:
+                self._draw(stage)
+
+    def _due(self, last: float, every: float) -> bool:
+        """Whether so many seconds are over; the ranks agree, as each has its own clock."""
+        over = torch.tensor([float(time.monotonic() - last > every)], device=self.config.device)
+        return bool(self.ranks.total(over) > 0)
+
+    def _step(self, stage: Stage, optimizer: torch.optim.Adam, index: Tensor, done: float) -> None:
+        """One batch."""
+        rate = schedule(stage, optimizer, done)
+        own = self.ranks.share(index)
+        share = len(own) / len(index)
+        observation, labels = self.data.batch(own.to(self.config.device))
+        step = Step(stage=stage.name, progress=done, generator=self.state.noise)
+        compute = partial(self.method.losses, observation, labels, step)
+        try:
+            values = self.descent.step(optimizer, compute, share)
+        except NotFiniteError as problem:
+            message = self._post_mortem(problem, stage, own)
+            self.ranks.wait()  # the first to end takes the others with it
+            raise TrainingError(message) from None
+        self.state.position.step += 1
+        if values is not None:
+            weighted = {name: value.detach() * share for name, value in values.items()}
+            self.log.collect(weighted, rate)
+        if self.state.position.step % self.config.log_every == 0:
+            self.log.write(self.state.position.step, stage.name)
+
+    def _post_mortem(self, problem: NotFiniteError, stage: Stage, index: Tensor) -> str:
+        """Save the batch where it is this rank's; the message that names it."""
+        path, step = self.folder.path / BAD_BATCH, self.state.position.step
+        found = f"rank {problem.rank} with another"
+        if problem.rank == self.ranks.rank:
+            observation, _ = self.data.batch(index.to(self.config.device))
+            found = save_batch(path, stage.name, observation.points, index, problem.terms)
+        return (
+            f"{path}: expected a finite {problem.what} in stage {stage.name!r} at step {step}, "
+            f"found {found}; the batch is saved there"
+        )
+
+    def _draw(self, stage: Stage) -> None:
+        """The method's pictures of a few fixed clouds, by the first rank."""
+        self.drawn = time.monotonic()
+        if self.config.pictures_every is not None and self.ranks.first:
+            draw_progress(
+                self.method, self.data.observation, stage.name, self.log, self.state.position.step
+            )
+
+    def _save(self, optimizer: torch.optim.Adam | None, *, finished: bool = False) -> None:
+        noises = self.ranks.every(self.state.noise.get_state(), self.config.device)
+        self.state.position.scaler = self.descent.scaler.state_dict()
+        if self.ranks.first:
+            self.folder.save(self.state, noises, optimizer, finished=finished)
+        self.saved = time.monotonic()

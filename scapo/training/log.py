@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""The record of a run: metrics.jsonl, and TensorBoard where it is installed.
+
+The batch on which a training stopped.
+
+Pictures of a training in progress: the same few clouds each time, where they can be drawn.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TextIO
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from scapo import drawing as draw
+from scapo.drawing import PictureData
+from scapo.method import AbstractMethod
+from scapo.store.checkpoint import array
+from scapo.store.files import canonical_json, write, write_bytes
+from scapo.types import Observation
+
+PICTURES = "pictures"
+"""Folder of the pictures of a run."""
+
+
+def alone(values: Tensor) -> Tensor:
+    """The sum over one rank."""
+    return values
+
+
+class Log:
+    """Means over a few steps, one JSON line each; the same run writes the same bytes."""
+
+    def __init__(
+        self, folder: Path | None, step: int, total: Callable[[Tensor], Tensor] = alone
+    ) -> None:
+        """Open the log of a run that has done `step` steps; later lines are dropped.
+
+        Args:
+            folder: Of the run; None: nothing is written, as on all ranks but the first.
+            step: Steps done.
+            total: Sums what the ranks have collected.
+        """
+        self.folder, self.total = folder, total
+        self.file = None if folder is None else _continued(folder / "metrics.jsonl", step)
+        self.board = None if folder is None else _board(folder / "tensorboard", step)
+        self.sums: dict[str, Tensor] = {}
+        self.count = 0
+        self.rate = 0.0
+        self.latest: float | None = None
+
+    def collect(self, values: dict[str, Tensor], rate: float) -> None:
+        """Add one step's scalars and learning rate; nothing is copied from the device yet."""
+        for name, value in values.items():
+            held = value.detach()
+            self.sums[name] = self.sums[name] + held if name in self.sums else held
+        self.count += 1
+        self.rate = rate
+
+    def write(self, step: int, stage: str) -> None:
+        """A line of the means since the last one."""
+        if not self.count:
+            return
+        means = torch.stack([value.double() for value in self.sums.values()]) / self.count
+        means = self.total(means)
+        row = dict(zip(self.sums, means.tolist(), strict=True))
+        self.latest = row["loss"]
+        record = {"step": step, "stage": stage, "lr": self.rate, **row}
+        if self.file is not None:
+            self.file.write(canonical_json(record) + "\n")
+            self.file.flush()
+        for name, value in row.items():
+            self.scalar(f"{stage}/{name}", value, step)
+        self.sums, self.count = {}, 0
+
+    def scalar(self, name: str, value: float, step: int) -> None:
+        """A number for TensorBoard alone."""
+        if self.board is not None:
+            self.board.add_scalar(name, value, step)
+
+    def picture(self, name: str, picture: PictureData, step: int) -> None:
+        """A PNG in pictures/, replacing the one of that name, and an image for TensorBoard."""
+        if self.folder is None:
+            return
+        png, pixels = draw.render(picture)
+        write_bytes(self.folder / PICTURES / f"{name}.png", png)
+        if self.board is not None:
+            self.board.add_image(name, pixels, step, dataformats="HWC")
+
+    def close(self) -> None:
+        """Flush both."""
+        if self.file is not None:
+            self.file.close()
+        if self.board is not None:
+            self.board.close()
+
+
+def _continued(path: Path, step: int) -> TextIO:
+    """The file, open for more, without lines after that step."""
+    lines = path.read_text().splitlines() if path.is_file() else []
+    kept = [line for line in lines if _step_of(line) <= step]
+    write_bytes(path, "".join(f"{line}\n" for line in kept).encode())
+    return path.open("a")
+
+
+def _step_of(line: str) -> float:
+    """The step of a line; infinite for one that a kill cut off."""
+    try:
+        return json.loads(line)["step"]
+    except ValueError:
+        return float("inf")
+
+
+def _board(folder: Path, step: int) -> Any:  # noqa: ANN401 - None, or a writer of an extra
+    if importlib.util.find_spec("tensorboard") is None:
+        return None
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=step or None)
+
+
+BAD_BATCH = "bad-batch.safetensors"
+
+
+def save_batch(
+    path: Path,
+    stage: str,
+    points: Float[Tensor, "B N 3"],
+    index: Int[Tensor, " B"],
+    terms: dict[str, Tensor],
+) -> str:
+    """Write clouds, their indices in the split and the terms of the loss; what is wrong."""
+    values = {name: str(float(value.detach())) for name, value in terms.items()}
+    header = {"format": "scapo-bad-batch/1", "stage": stage, "terms": values}
+    write(path, {"points": array(points), "index": array(index)}, header)
+    bad = [name for name, value in values.items() if not math.isfinite(float(value))]
+    if bad:
+        return ", ".join(bad)
+    return "finite terms with a bad gradient" if values else "a matrix without decomposition"
+
+
+SHOWN = 6
+"""Training clouds that are shown, evenly taken from the data."""
+
+
+def can_draw() -> bool:
+    """Whether matplotlib and pillow are installed."""
+    return all(importlib.util.find_spec(name) is not None for name in ("matplotlib", "PIL"))
+
+
+def shown(observation: Observation, count: int = SHOWN) -> Observation:
+    """The clouds that pictures show."""
+    number = observation.points.shape[0]
+    count = min(count, number)
+    index = torch.arange(count, device=observation.points.device) * number // count
+    return Observation(points=observation.points[index])
+
+
+@torch.no_grad()
+def draw_progress(
+    method: AbstractMethod, observation: Observation, stage: str, log: Log, step: int
+) -> None:
+    """Hand the method's pictures to the log, named `STAGE-NAME`; nothing where none are drawn."""
+    if not can_draw():
+        return
+    was_training = method.training
+    method.eval()
+    for name, picture in method.pictures(shown(observation), stage).items():
+        log.picture(f"{stage}-{name}", picture, step)
+    method.train(was_training)

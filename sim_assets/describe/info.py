@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: MIT
+"""What a data set holds, as text: counts, histograms of states and views, digests, damage."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from scapo.store import Split, StoreError
+from scapo.store.manifest import Manifest
+from sim_assets.sampling.viewpoints import direction_angles
+
+BARS = " ▁▂▃▄▅▆▇█"
+BINS = 24
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """Of one split."""
+
+    text: str
+    whole: bool
+    """Whether all shards have the bytes that the manifest says."""
+
+
+def find_splits(path: Path) -> list[Path]:
+    """Folders with a manifest, at `path` or below it.
+
+    Raises:
+        StoreError: There is none.
+    """
+    found = sorted(manifest.parent for manifest in path.rglob("manifest.json"))
+    if not found:
+        raise StoreError(f"{path}: expected a data set (manifest.json), found none")
+    return found
+
+
+def describe_folder(path: Path) -> Iterator[Report]:
+    """A report for each split at `path` or below it.
+
+    Raises:
+        StoreError: There is no data set, or a manifest is broken.
+    """
+    for folder in find_splits(path):
+        yield describe_split(Split(folder))
+
+
+def describe_split(split: Split) -> Report:
+    """The report of one split; its shards are read, and compared with their hashes."""
+    manifest = split.manifest
+    lines = [f"{split.folder}", *_facts(manifest)]
+    try:
+        split.verify()
+        lines += histograms(split)
+        lines.append(f"  shards     {len(manifest.shards)}, all whole")
+    except StoreError as error:
+        return Report(text="\n".join([*lines, f"  DAMAGED    {error}"]), whole=False)
+    return Report(text="\n".join(lines), whole=True)
+
+
+def _facts(manifest: Manifest) -> list[str]:
+    options = manifest.options
+    told = ("protocol", "preset", "noise", "mask", "backend", "sampling", "source")
+    how = ", ".join(f"{name} {options[name]}" for name in told if options.get(name) is not None)
+    lines = [
+        f"  category   {manifest.category} ({', '.join(manifest.parts)}), split {manifest.split}",
+        f"  samples    {manifest.count} of {manifest.points} points, "
+        f"{len(manifest.instances)} objects, seed {manifest.seed}",
+        f"  options    {how}",
+        "  versions   " + ", ".join(f"{k} {v}" for k, v in sorted(manifest.versions.items())),
+        f"  digest     {manifest.digest}",
+        f"  plan       {manifest.plan_digest}",
+    ]
+    facts = manifest.statistics
+    if "redrawn_share" in facts:
+        lines.append(f"  redrawn    {100 * facts['redrawn_share']:.2f} % of the views drawn")
+    if facts.get("samples_lost") or facts.get("objects_refused"):
+        lines.append(
+            f"  left out   {facts.get('objects_refused', 0):.0f} objects refused, "
+            f"{facts.get('objects_failed', 0):.0f} failed, "
+            f"{facts.get('samples_lost', 0):.0f} samples lost"
+        )
+    return lines
+
+
+def histograms(split: Split) -> list[str]:
+    """One line each for joint states, views, and the parts' share of points."""
+    manifest = split.manifest
+    data = split.arrays("part", "camera_T_part", "joint_state", "visible", "instance")
+    lines = []
+    for j, joint in enumerate(manifest.joints):
+        turning = joint.kind == "revolute"
+        state = data["joint_state"][:, j]
+        values, unit = (np.degrees(state), "deg") if turning else (state, "m")
+        lines.append(histogram(f"joint {j}", values, unit))
+    pose = data["camera_T_part"][:, 0].astype(np.float64)
+    eye = -(pose[:, :3, :3].transpose(0, 2, 1) @ pose[:, :3, 3:])[..., 0]
+    angles = direction_angles(eye)
+    lines.append(histogram("azimuth", angles[:, 0], "deg"))
+    lines.append(histogram("elevation", angles[:, 1], "deg"))
+    lines.append(histogram("distance", np.linalg.norm(eye, axis=-1), "m"))
+    for p, name in enumerate(manifest.parts):
+        share = 100 * (data["part"] == p).mean(-1)
+        lines.append(histogram(f"points on {name}", share, "%"))
+        lines.append(histogram(f"{name} visible", 100 * data["visible"][:, p], "%"))
+    per_object = np.bincount(data["instance"], minlength=len(manifest.instances))
+    lines.append(f"  per object {per_object.min()} to {per_object.max()} samples")
+    return lines
+
+
+def describe_state(state: float, kind: str) -> str:
+    """A joint's state with its unit, a dash where it is not known."""
+    if not math.isfinite(state):
+        return "–"
+    return f"{math.degrees(state):.0f}°" if kind == "revolute" else f"{100 * state:.0f} cm"
+
+
+def histogram(name: str, values: Float[np.ndarray, " K"], unit: str) -> str:
+    """One line: name, least value, bars, greatest value and unit, mean; of the known values."""
+    values = values[~np.isnan(values)]
+    if not len(values):
+        return f"  {name:22} unknown"
+    low, high = float(values.min()), float(values.max())
+    counts, _ = np.histogram(values, bins=BINS, range=(low, high if high > low else low + 1))
+    level = np.ceil(counts / counts.max() * (len(BARS) - 1)).astype(int)
+    bars = "".join(BARS[i] for i in level)
+    mean = f"mean {values.mean():.4g}"
+    return f"  {name:22} {low:9.4g} {bars} {high:.4g} {unit}, {mean}"

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Other people's array files, read without running what they hold."""

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Splits of clouds on disk, planned, made by workers, resumable: `generate.generate`."""

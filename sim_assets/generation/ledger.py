@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: MIT
+"""The state of a split that is being made, kept in its folder so that it can be taken up again.
+
+`.plan.json`: what is being made, and the objects as first read. `.finished`: one line per finished
+shard with the SHA-256 of its bytes. Both go when the manifest is written.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from scapo.store import canonical_json, sha256_file, write_bytes
+from scapo.store.manifest import Instance, Manifest, ManifestError, read_manifest
+from sim_assets.generation.assets import Asset
+from sim_assets.generation.plan import Entry
+from sim_assets.generation.shard import ShardDone, read_done
+
+PLAN = ".plan.json"
+FINISHED = ".finished"
+SEEN = 60.0
+"""Seconds after which a shard that another machine wrote must be seen here."""
+PLAN_FORMAT = "scapo-plan/1"
+
+
+class GenerateError(RuntimeError):
+    """A split cannot be made: `where: what was expected, what was found`."""
+
+
+class Ledger:
+    """The folder of a split: locked while open, and checked against what is to be made."""
+
+    def __init__(
+        self, folder: Path, identity: Mapping[str, Any], versions: Mapping[str, str]
+    ) -> None:
+        """Nothing is touched before the context is entered.
+
+        Args:
+            folder: Of the split.
+            identity: What is to be made, as JSON values.
+            versions: Of what makes the pixels.
+        """
+        self.folder = folder
+        self.identity = json.loads(canonical_json(identity))
+        self.versions = dict(versions)
+        self.manifest: Manifest | None = None
+        self.plan: dict[str, Any] | None = None
+        self._lock = -1
+
+    def __enter__(self) -> Ledger:
+        """Create and lock the folder, and read what is there.
+
+        Raises:
+            GenerateError: It holds something else, or another process is writing there.
+        """
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(self.folder, os.O_RDONLY)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise GenerateError(
+                f"{self.folder}: expected to write here alone, found another run doing so"
+            ) from error
+        except OSError as error:
+            raise GenerateError(f"{self.folder}: expected a folder to write to: {error}") from error
+        try:
+            self._look()
+        except BaseException:
+            os.close(self._lock)
+            raise
+        return self
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        """Unlock.
+
+        Raises:
+            GenerateError: In place of an OSError, which need not say where it arose.
+        """
+        os.close(self._lock)
+        if isinstance(error, OSError):
+            raise GenerateError(
+                f"{self.folder}: expected to be written to, found: {error.strerror or error}"
+            ) from error
+
+    def entries(self, assets: Sequence[Asset]) -> tuple[tuple[Entry, ...], dict[str, str]] | None:
+        """The objects as first read and those refused, if that was recorded."""
+        if self.plan is None:
+            return None
+        by_name = {asset.name: asset for asset in assets}
+        entries = tuple(
+            Entry(
+                asset=by_name[row["instance"]["id"]],
+                instance=Instance(**_tuples(row["instance"])),
+                geometry=row["geometry"],
+            )
+            for row in self.plan["entries"]
+        )
+        return entries, self.plan["refused"]
+
+    def begin(self, entries: Sequence[Entry], refused: Mapping[str, str]) -> None:
+        """Record the objects before the first shard is made.
+
+        Raises:
+            GenerateError: A finished data set is there, made from other objects.
+        """
+        if self.manifest is not None:
+            before = {(record.id, record.sha256) for record in self.manifest.instances}
+            if not before <= {(entry.instance.id, entry.instance.sha256) for entry in entries}:
+                raise GenerateError(
+                    f"{self.folder}: expected the objects of its manifest, found others; choose "
+                    "another folder or delete this one"
+                )
+        rows = [{"instance": asdict(e.instance), "geometry": e.geometry} for e in entries]
+        plan = {
+            "format": PLAN_FORMAT,
+            "identity": self.identity,
+            "versions": self.versions,
+            "entries": rows,
+            "refused": dict(refused),
+        }
+        write_bytes(self.folder / PLAN, canonical_json(plan).encode())
+
+    def finished(self) -> dict[str, ShardDone]:
+        """Shards that are there whole, by file name: none with an object that failed."""
+        done = {}
+        for file, sha256 in self._recorded().items():
+            path = self.folder / file
+            if path.is_file() and sha256_file(path) == sha256:
+                shard = read_done(path, sha256)
+                if not shard.failed:
+                    done[file] = shard
+        return done
+
+    def record(self, shard: ShardDone) -> None:
+        """Note that a shard is finished.
+
+        Raises:
+            GenerateError: Another machine says that it wrote it, but it is not there.
+        """
+        path = self.folder / shard.file
+        until = time.monotonic() + SEEN
+        while not path.exists():  # a network file system may show it late
+            if time.monotonic() > until:
+                raise GenerateError(
+                    f"{path}: expected a shard that is said to be written, found none: is the "
+                    "folder on storage that all machines share?"
+                )
+            time.sleep(0.1)
+            os.listdir(self.folder)  # noqa: PTH208 - makes an NFS client look again
+        with (self.folder / FINISHED).open("a") as file:
+            file.write(f"{shard.sha256}  {shard.file}\n")
+
+    def finish(self, manifest: Manifest, empty: Sequence[str]) -> None:
+        """Write the manifest, then remove what was needed only until now."""
+        write_bytes(self.folder / "manifest.json", manifest.to_json().encode())
+        for name in (*empty, FINISHED, PLAN):
+            (self.folder / name).unlink(missing_ok=True)
+
+    def _look(self) -> None:
+        for path in self.folder.glob(".*.tmp"):  # of a run that was killed while writing
+            path.unlink(missing_ok=True)
+        if (self.folder / "manifest.json").exists():
+            try:
+                self.manifest = read_manifest(self.folder / "manifest.json")
+            except ManifestError as error:
+                raise GenerateError(f"{error}; delete the folder to make it anew") from error
+            self._compare(self._identity_of(self.manifest))
+        if (self.folder / PLAN).exists():
+            self.plan = self._read_plan()
+            self._compare(self.plan["identity"])
+            if self.plan["versions"] != self.versions:
+                raise GenerateError(
+                    f"{self.folder}: expected the versions it was begun with, "
+                    f"{_difference(self.plan['versions'], self.versions)}; delete the folder to "
+                    "make it anew"
+                )
+        if self.manifest is None and self.plan is None:
+            found = sorted(path.name for path in self.folder.glob("*.safetensors"))
+            if found:
+                raise GenerateError(
+                    f"{self.folder}: expected an empty folder, found {found[0]} without a manifest"
+                )
+
+    def _read_plan(self) -> dict[str, Any]:
+        try:
+            plan = json.loads((self.folder / PLAN).read_text())
+        except (OSError, ValueError) as error:
+            raise GenerateError(f"{self.folder / PLAN}: expected JSON, found {error}") from error
+        if not isinstance(plan, dict) or plan.get("format") != PLAN_FORMAT:
+            raise GenerateError(f"{self.folder / PLAN}: expected format {PLAN_FORMAT!r}")
+        return plan
+
+    def _recorded(self) -> dict[str, str]:
+        recorded = {}
+        if self.manifest is not None:
+            recorded = {shard.file: shard.sha256 for shard in self.manifest.shards}
+        try:
+            lines = (self.folder / FINISHED).read_text().splitlines()
+        except FileNotFoundError:
+            lines = []
+        for line in lines:
+            sha256, _, file = line.partition("  ")
+            if len(sha256) == 64 and Path(file).suffix == ".safetensors":  # else cut off
+                recorded[Path(file).name] = sha256
+        return recorded
+
+    def _identity_of(self, manifest: Manifest) -> dict[str, Any]:
+        options = dict(manifest.options)
+        options.pop("samples_per_instance", None)
+        return {
+            "category": manifest.category,
+            "split": manifest.split,
+            "seed": manifest.seed,
+            "count": self.identity["count"]
+            if manifest.statistics.get("samples_lost")
+            else manifest.count,
+            "options": options,
+        }
+
+    def _compare(self, there: dict[str, Any]) -> None:
+        if there != self.identity:
+            raise GenerateError(
+                f"{self.folder}: expected what was begun there, "
+                f"{_difference(there, self.identity)}; choose another folder or delete this one"
+            )
+
+
+def _difference(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
+    """`points 1024, found points 512` for the first field that differs."""
+    for name in sorted({*there, *asked}):
+        a, b = there.get(name), asked.get(name)
+        if a == b:
+            continue
+        if isinstance(a, dict) and isinstance(b, dict):
+            return _difference(a, b)
+        return f"{name} {a}, found {name} {b}"
+    return "the same"
+
+
+def _tuples(row: dict[str, Any]) -> dict[str, Any]:
+    """Lists of a JSON object as tuples."""
+
+    def frozen(value: Any) -> Any:  # noqa: ANN401
+        return tuple(frozen(item) for item in value) if isinstance(value, list) else value
+
+    return {name: frozen(value) for name, value in row.items()}

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""From options to a request: the objects to choose from, the renderer, the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import metadata
+from math import ceil
+from pathlib import Path
+
+from scapo.categories import category as find_category
+from sim_assets.generation.assets import Asset, folder_assets, procedural_assets
+from sim_assets.generation.plan import Request
+from sim_assets.options import DataOptions, Protocol
+from sim_assets.rendering.backends import resolve_backend
+from sim_assets.rendering.base import Backend
+from sim_assets.sampling.presets import camera, rules
+from sim_assets.sampling.samples import Settings
+
+SAMPLES_PER_INSTANCE = 50
+"""By default, as the benchmark's training split (CONTRACT 4)."""
+MIN_IMAGE, MAX_IMAGE = 32, 4096
+
+
+def make_request(category: str, options: DataOptions) -> tuple[Request, list[Asset]]:
+    """The request and the objects to choose from.
+
+    Raises:
+        ValueError: An option is out of range, the category is unknown, or has no such objects.
+        RenderError: The backend does not work here.
+    """
+    find_category(category)
+    _check(options)
+    procedural = options.source == "procedural"
+    if procedural:
+        instances = options.instances or ceil(options.count / SAMPLES_PER_INSTANCE)
+        assets = procedural_assets(category, options.split, options.seed, instances)
+    else:
+        assets = _models(category, options)
+        instances = options.instances or min(len(assets), options.count)
+    given = {name: getattr(options, name) for name in ("up", "front", "scale")}
+    request = Request(
+        category=category,
+        split=options.split,
+        seed=options.seed,
+        count=options.count,
+        instances=instances,
+        source="procedural" if procedural else "urdf",
+        source_options={name: value for name, value in given.items() if value is not None},
+        settings=_settings(options),
+    )
+    return request, assets
+
+
+def versions(backend: Backend | None, protocol: Protocol) -> dict[str, str]:
+    """Versions of what makes the pixels here."""
+    names = ["scapo", "numpy", "trimesh"]
+    drawn: dict[str, str] = {}
+    if protocol != "full" and backend == "raycast":
+        names.append("embreex")
+    elif protocol != "full" and backend == "sapien":
+        from sim_assets.rendering import sapien as scene
+
+        drawn = scene.versions()
+    elif protocol != "full" and backend == "maniskill":
+        from sim_assets.rendering import maniskill as parallel_scene
+
+        drawn = parallel_scene.versions()
+    return {**{name: metadata.version(name) for name in names}, **drawn}
+
+
+def _settings(options: DataOptions) -> Settings:
+    preset = rules(options.preset)
+    protocol = options.protocol or preset.protocol
+    needed = protocol != "full"
+    if not needed and (options.noise, options.mask) != ("none", "exact"):
+        raise ValueError(
+            f"noise and mask: expected none and exact with protocol full, which has no picture, "
+            f"found {options.noise} and {options.mask}"
+        )
+    return Settings(
+        protocol=protocol,
+        backend=resolve_backend(options.backend) if needed else None,
+        camera=camera(options.preset, options.image_size),
+        points=options.points,
+        sampling=options.sampling or preset.sampling,
+        color=options.color,
+        states_per_view=options.states_per_view,
+        preset=options.preset,
+        held_out=options.split in ("test", "test-ood"),
+        noise=options.noise,
+        mask=options.mask,
+    )
+
+
+def _models(category: str, options: DataOptions) -> list[Asset]:
+    if options.split == "test-ood":
+        raise ValueError("split test-ood: expected procedural objects, found --source with a path")
+    found = folder_assets(
+        Path(options.source),
+        category,
+        options.split,
+        up=options.up,
+        front=options.front,
+        scale=options.scale,
+    )
+    if options.instances is not None and options.instances > len(found):
+        raise ValueError(
+            f"instances: expected at most {len(found)}, the models of split {options.split!r} in "
+            f"{options.source}, found {options.instances}"
+        )
+    return found
+
+
+def _check(options: DataOptions) -> None:
+    """Refuse values out of range.
+
+    Raises:
+        ValueError: `option: expected, found`.
+    """
+    least: Sequence[tuple[str, int | None, int]] = (
+        ("count", options.count, 1),
+        ("instances", options.instances, 1),
+        ("seed", options.seed, 0),
+        ("points", options.points, 8),
+        ("states_per_view", options.states_per_view, 1),
+        ("image_size", options.image_size, MIN_IMAGE),
+    )
+    for name, value, minimum in least:
+        if value is not None and value < minimum:
+            raise ValueError(f"{name}: expected {minimum} or more, found {value}")
+    if options.image_size is not None and options.image_size > MAX_IMAGE:
+        raise ValueError(f"image_size: expected {MAX_IMAGE} or less, found {options.image_size}")
+    if options.instances is not None and options.instances > options.count:
+        raise ValueError(
+            f"instances: expected at most count, {options.count}, found {options.instances}"
+        )
+    if options.count % options.states_per_view:
+        raise ValueError(
+            f"count: expected a multiple of states_per_view, {options.states_per_view}, found "
+            f"{options.count}"
+        )
+    if options.source == "procedural" and (options.up or options.front or options.scale):
+        raise ValueError("up, front, scale: expected only with a --source folder of models")

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""External data sets brought into our layouts (`scapo-data import`).
+
+Clouds (`op-align-real`, `op-align-light`) become splits that every program here reads, models
+(`shape2motion`, `hoi4d`, `partnet-mobility`) URDF folders for `scapo-data generate --source`. A
+file that cannot be used is named with the reason and left out; nothing takes its place.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
+
+from scapo.export.urdf import write_urdf
+from sim_assets.importers import hoi4d, op_align_light, op_align_real, shape2motion
+from sim_assets.importers import partnet_mobility as partnet_models
+from sim_assets.importers.clouds import CloudFile
+from sim_assets.importers.models import Folder, Model
+from sim_assets.importers.splits import CloudReader, SplitWriter, import_split
+
+SetName = Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "partnet-mobility"]
+Progress = Callable[[str, int, int], None]
+
+
+@runtime_checkable
+class ModelReader(Protocol):
+    """A module of `sim_assets.models.sources` that reads models."""
+
+    @staticmethod
+    def find(path: Path) -> list[Folder]:
+        """The models of the set below a path."""
+        ...
+
+    @staticmethod
+    def read(folder: Folder) -> Model:
+        """One model."""
+        ...
+
+
+CLOUDS: dict[str, CloudReader] = {
+    "op-align-real": op_align_real,
+    "op-align-light": op_align_light,
+}
+MODELS: dict[str, ModelReader] = {
+    "shape2motion": shape2motion,
+    "hoi4d": hoi4d,
+    "partnet-mobility": partnet_models,
+}
+
+
+@dataclass(slots=True, kw_only=True)
+class Imported:
+    """What became of a set."""
+
+    written: list[Path] = field(default_factory=list)
+    """Folders of splits, or URDF files."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """File or folder -> why it could not be used."""
+    notes: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Model -> what was put right."""
+    samples: int = 0
+    """Clouds written."""
+
+
+def import_set(
+    name: str,
+    path: Path,
+    out: Path,
+    *,
+    points: int = 1024,
+    strict: bool = False,
+    progress: Progress | None = None,
+) -> Imported:
+    """Bring a set into our layout.
+
+    Args:
+        name: One of `SetName`.
+        path: The set's folder, or one above or within it.
+        out: Clouds: `out/<category>/<split>`, with the set's own names of variant and category
+            above where one category and split has several. Models: `out/<category>/<id>`.
+        points: Of each cloud.
+        strict: Raise at the first file that cannot be used.
+        progress: Told what is being read, how many are done, how many there are.
+
+    Raises:
+        ValueError: No such set, nothing of it at `path`, a target that holds something else; with
+            `strict`, the first file that cannot be used.
+    """
+    if name not in CLOUDS and name not in MODELS:
+        known = ", ".join((*CLOUDS, *MODELS))
+        raise ValueError(f"set {name!r}: expected one of {known}")
+    if points < 1:
+        raise ValueError(f"points: expected 1 or more, found {points}")
+    result = Imported()
+
+    def refuse(what: str, error: ValueError) -> None:
+        if strict:
+            raise error
+        text = " ".join(str(error).split())
+        result.refused[what] = text.removeprefix(f"{what}: ")
+
+    if (path.resolve() if path.is_dir() else path.resolve().parent) == out.resolve():
+        raise ValueError(f"{out}: expected a folder outside the source, found the source itself")
+    show = progress or (lambda what, done, total: None)
+    if name in MODELS:
+        _models(MODELS[name], path, out, result, (refuse, show))
+    else:
+        _clouds(CLOUDS[name], path, (out, points), result, (refuse, show))
+    return result
+
+
+Calls = tuple[Callable[[str, ValueError], None], Progress]
+
+
+def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls: Calls) -> None:
+    refuse, show = calls
+    folders = reader.find(path)
+    source = Path(os.path.commonpath([folder.path for folder in folders]))
+    seen: dict[Path, str] = {}
+    for done, folder in enumerate(folders):
+        show("models", done, len(folders))
+        target = out / folder.category / folder.id
+        try:
+            if target in seen:
+                raise ValueError(
+                    f"{folder.path}: expected one model {folder.category}/{folder.id}, found "
+                    f"{seen[target]} too"
+                )
+            refuse_inside(target, folder.path, source)
+            model = reader.read(folder)
+            result.written.append(write_urdf(target, model.links, model.joints, model.name))
+        except ValueError as error:
+            refuse(str(folder.path), error)
+            continue
+        seen[target] = folder.name
+        if model.notes:
+            result.notes[folder.name] = model.notes
+    show("models", len(folders), len(folders))
+
+
+def refuse_inside(target: Path, *sources: Path) -> None:
+    """Refuse a target that lies in what is read, or around it: it would overwrite originals.
+
+    Raises:
+        ValueError: Naming both.
+    """
+    place = target.resolve()
+    for source in sources:
+        real = source.resolve()
+        if place == real or real in place.parents or place in real.parents:
+            raise ValueError(f"{target}: expected a place outside the source, found it in {source}")
+
+
+def _clouds(
+    reader: CloudReader, path: Path, wanted: tuple[Path, int], result: Imported, calls: Calls
+) -> None:
+    refuse, show = calls
+    out, points = wanted
+    files = sorted(reader.find(path), key=_split_of)
+    source = Path(os.path.commonpath([file.path.parent for file in files]))
+    several = _several(files)
+    done = 0
+
+    def counted(group: list[CloudFile]) -> Iterator[CloudFile]:
+        nonlocal done
+        for file in group:
+            show("clouds", done, len(files))
+            yield file
+            done += 1
+
+    for (category, split, variant), group in groupby(files, key=_split_of):
+        members = list(group)
+        top = out / variant if (category, split) in several else out
+        writer = SplitWriter(
+            folder=top / (category or "misplaced") / (split or "misplaced"),
+            category=category,
+            split=split,
+            points=points,
+            set_name=reader.SET,
+            variant=variant,
+        )
+        refuse_inside(writer.folder, *(file.path for file in members), source)
+        folder = import_split(reader, writer, counted(members), refuse)
+        if folder is not None:
+            result.written.append(folder)
+            result.samples += writer.count
+    show("clouds", len(files), len(files))
+
+
+def _split_of(file: CloudFile) -> tuple[str, str, str]:
+    return file.category, file.split, file.variant
+
+
+def _several(files: list[CloudFile]) -> set[tuple[str, str]]:
+    """Category and split pairs of which there is more than one variant."""
+    variants: dict[tuple[str, str], set[str]] = {}
+    for file in files:
+        variants.setdefault((file.category, file.split), set()).add(file.variant)
+    return {pair for pair, names in variants.items() if len(names) > 1}

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Data sets and models to look at: contact sheet, browser, check."""

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: MIT
+"""`scapo-data check`: every model of a folder read in a worker process, and what came of it.
+
+A model that crashes, hangs or eats the memory costs itself alone. The command ends 1 when any
+model is refused, 0 when all are accepted or repaired.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from scapo.parallel.pool import Outcome, Pool, Report
+from scapo.store.files import write_bytes
+from scapo.types import JointKind, JointSpec
+from sim_assets.generation.request import make_request
+from sim_assets.models.joints import Candidate, candidates
+from sim_assets.models.library import find, source_root
+from sim_assets.models.reader import Model, load, read
+from sim_assets.models.resolver import SourceFiles
+from sim_assets.models.validate import AssetError, Repairs, refuse
+from sim_assets.objects import ArticulatedObject
+from sim_assets.options import DataOptions
+from sim_assets.rendering.backends import make_renderer
+from sim_assets.sampling.samples import Shooter, ViewError
+
+FORMAT = "scapo-check/1"
+Status = Literal["accepted", "repaired", "refused"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Options:
+    """How to read the models; None: as the source says."""
+
+    category: str | None = None
+    """Check as objects of this category; else that some joint can be used at all."""
+    up: str | None = None
+    front: str | None = None
+    scale: float | None = None
+    timeout: float = 120.0
+    """Seconds for one model."""
+    memory: int = 4 << 30
+    """Bytes for one model."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Result:
+    """What came of one model."""
+
+    path: str
+    """Relative to the folder checked."""
+    status: Status
+    reason: str = ""
+    """Why it is refused: what was expected, what was found, where."""
+    repairs: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    """Joints that a category can use; with a category given, those chosen."""
+    triangles: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Model:
+    """A job for a worker."""
+
+    urdf: Path
+    root: Path
+    options: Options
+
+
+def check(
+    path: Path,
+    options: Options | None = None,
+    *,
+    workers: int = 1,
+    on_result: Callable[[Result], None] | None = None,
+) -> list[Result]:
+    """Check all models of a folder.
+
+    Args:
+        path: A folder, searched recursively, or one `.urdf` file.
+        options: Category and limits.
+        workers: Processes.
+        on_result: Called with each result as it comes.
+
+    Returns:
+        A result for each model, in the order of `library.find`.
+
+    Raises:
+        AssetError: No such folder, or no model in it.
+    """
+    options = options or Options()
+    root = source_root(path)
+    models = [_Model(urdf=urdf, root=root, options=options) for urdf in find(path)]
+    results: dict[Path, Result] = {}
+    pool: Pool[_Model, Result] = Pool(min(workers, len(models)), timeout=options.timeout)
+    with pool:
+        for outcome in pool.run(_job, models):
+            result = _result(outcome)
+            results[outcome.job.urdf] = result
+            if on_result is not None:
+                on_result(result)
+    return [results[model.urdf] for model in models]
+
+
+def report(results: Iterable[Result]) -> dict[str, Any]:
+    """What the JSON file holds."""
+    rows = [asdict(result) for result in results]
+    counts = Counter(row["status"] for row in rows)
+    return {
+        "format": FORMAT,
+        "counts": {status: counts[status] for status in get_args(Status)},
+        "assets": rows,
+    }
+
+
+def write_report(results: Iterable[Result], path: Path) -> None:
+    """Write `report` as sorted JSON, atomically."""
+    text = json.dumps(report(results), sort_keys=True, indent=1, ensure_ascii=False)
+    write_bytes(path, (text + "\n").encode())
+
+
+def exit_code(results: Iterable[Result]) -> int:
+    """1 when any model is refused, else 0."""
+    return int(any(result.status == "refused" for result in results))
+
+
+def _job(model: _Model, send: Report) -> Result:
+    """In the worker."""
+    limit_memory(model.options.memory)
+    send(str(model.urdf), 0)
+    return check_one(model.urdf, model.root, model.options)
+
+
+def _result(outcome: Outcome[_Model, Result]) -> Result:
+    model = outcome.job
+    name = model.urdf.resolve().relative_to(model.root.resolve()).as_posix()
+    result = outcome.result
+    if result is None:
+        reason = f"{name}: expected to be read, found that {outcome.reason}"
+        return Result(path=name, status="refused", reason=reason)
+    return replace(result, path=name, reason=result.reason.replace(f"{model.root}/", ""))
+
+
+def limit_memory(extra: int) -> None:
+    """Let this process take `extra` bytes more than it has now; beyond it memory errors arise.
+
+    Does nothing where the system has no such limit (Windows) or does not tell its size (macOS).
+    """
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except (ImportError, OSError):
+        return
+    _, hard = resource.getrlimit(resource.RLIMIT_AS)
+    wanted = pages * resource.getpagesize() + extra
+    if hard != resource.RLIM_INFINITY:
+        wanted = min(wanted, hard)
+    resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
+
+
+def check_one(urdf: Path, root: Path, options: Options) -> Result:
+    """Check one model in this process; refusals are results, other errors are raised."""
+    repairs = Repairs()
+    try:
+        if options.category is None:
+            joints, triangles = _general(urdf, root, repairs)
+            said = repairs.sentences()
+        else:
+            thing = read(
+                urdf,
+                options.category,
+                up=options.up,
+                front=options.front,
+                scale=options.scale,
+                root=root,
+            )
+            show(urdf, thing)
+            joints, said = thing.origin.joint_names, thing.origin.repairs
+            triangles = sum(len(visual.mesh.faces) for part in thing.visuals for visual in part)
+    except AssetError as error:
+        reason, said = str(error), repairs.sentences()
+        return Result(path=str(urdf), status="refused", reason=reason, repairs=said)
+    status: Status = "repaired" if said else "accepted"
+    return Result(path=str(urdf), status=status, repairs=said, joints=joints, triangles=triangles)
+
+
+def show(urdf: Path, thing: ArticulatedObject) -> None:
+    """Make one sample, as `generate` would; by ray casting, which draws the same everywhere.
+
+    Raises:
+        AssetError: No view shows enough of every part.
+    """
+    request, _ = make_request(thing.category.name, DataOptions(count=1, backend="raycast"))
+    with make_renderer("raycast") as renderer:
+        try:
+            list(Shooter(renderer, thing, request.settings).shots([("check",)]))
+        except ViewError as error:
+            reason = str(error).removeprefix(f"{thing.instance}: expected ")
+            raise AssetError(f"{urdf}: expected {reason}") from error
+
+
+def _general(urdf: Path, root: Path, repairs: Repairs) -> tuple[tuple[str, ...], int]:
+    """Joints that some category could use, and the number of triangles."""
+    model = load(SourceFiles(urdf=urdf, root=root, repairs=repairs))
+    surfaces = model.surfaces
+    found, reasons = [], []
+    for kind in get_args(JointKind):
+        spec = JointSpec(kind=kind, parent=0, child=1, lower=0.0, upper=math.pi)
+        try:
+            found += _usable(model, spec)
+        except AssetError as error:
+            reasons.append(error)
+    if not found:
+        raise reasons[0] if reasons else refuse(urdf, "a joint that moves something", "none")
+    triangles = sum(len(v.mesh.faces) for visuals in surfaces.values() for v in visuals)
+    return tuple(candidate.joint.name for candidate in found), triangles
+
+
+def _usable(model: Model, spec: JointSpec) -> list[Candidate]:
+    found = candidates(model.robot, model.surfaces, spec, (), model.known)
+    return [c for c in found if set(model.surfaces) - model.robot.subtree(c.joint)]

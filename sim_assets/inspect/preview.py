@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""A contact sheet of a data set: clouds as the camera sees them, coloured by part, with axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from scapo.drawing import PART_COLORS, draw_axis, draw_cloud
+from scapo.store import Split, StoreError, write_bytes
+from scapo.store.manifest import Manifest
+from scapo.store.schema import UNLABELLED
+from sim_assets.describe.info import describe_state, find_splits
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLUMNS = 6
+TILE = 2.1
+"""Inches."""
+DPI = 150
+PAPER, INK, FAINT = "#ffffff", "#222222", "#777777"
+AXIS = "#111111"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Tile:
+    """One sample to draw."""
+
+    manifest: Manifest
+    number: int
+    instance: str
+    points: Float[np.ndarray, "N 3"]
+    part: UInt8[np.ndarray, " N"]
+    pivot: Float[np.ndarray, "J 3"]
+    axis: Float[np.ndarray, "J 3"]
+    state: Float[np.ndarray, " J"]
+
+
+def draw_preview(
+    path: Path, out: Path, count: int, category: str | None = None, split: str | None = None
+) -> int:
+    """Draw `count` samples of each split at `path` or below it into one PNG.
+
+    Args:
+        path: A data set, or a category or split of one.
+        out: File to write, `.png`.
+        count: Samples per split, spread evenly.
+        category: Only this one.
+        split: Only this one.
+
+    Returns:
+        How many were drawn.
+
+    Raises:
+        StoreError: There is no such data set, or a shard is broken.
+        ValueError: `out` is no .png file, or `count` is below 1.
+    """
+    if out.suffix.lower() != ".png":
+        raise ValueError(f"{out}: expected a file name that ends in .png")
+    if count < 1:
+        raise ValueError(f"count: expected 1 or more, found {count}")
+    splits = [Split(folder) for folder in find_splits(path)]
+    chosen = [
+        data
+        for data in splits
+        if category in (None, data.manifest.category) and split in (None, data.manifest.split)
+    ]
+    if not chosen:
+        raise StoreError(f"{path}: expected {category or '*'}/{split or '*'}, found none")
+    tiles = [list(_tiles(data, count)) for data in chosen]
+    write_bytes(out, _picture(tiles))
+    return sum(len(row) for row in tiles)
+
+
+def _tiles(split: Split, count: int) -> Iterator[Tile]:
+    manifest = split.manifest
+    names = ("points", "part", "joint_pivot", "joint_axis", "joint_state", "instance")
+    data = split.arrays(*names)
+    number = min(count, manifest.count)
+    for i in np.unique(np.linspace(0, manifest.count - 1, number).round().astype(int)):
+        yield Tile(
+            manifest=manifest,
+            number=int(i),
+            instance=manifest.instances[int(data["instance"][i])].id,
+            points=data["points"][i],
+            part=data["part"][i],
+            pivot=data["joint_pivot"][i],
+            axis=data["joint_axis"][i],
+            state=data["joint_state"][i],
+        )
+
+
+def _picture(blocks: list[list[Tile]]) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(COLUMNS, max(len(block) for block in blocks))
+    rows = [math.ceil(len(block) / columns) for block in blocks]
+    heading = 0.5
+    height = sum(rows) * TILE + len(blocks) * heading + 0.1
+    figure = Figure(figsize=(max(columns, 3) * TILE, height), dpi=DPI, facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    top = 1.0
+    for block, count in zip(blocks, rows, strict=True):
+        _heading(figure, block[0].manifest, top, height)
+        top -= heading / height
+        for k, tile in enumerate(block):
+            row, column = divmod(k, columns)
+            width, tall = 1 / max(columns, 3), TILE / height
+            box = (column * width, top - (row + 1) * tall, width, tall)
+            _draw(figure.add_axes(box), tile)
+        top -= count * TILE / height
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _heading(figure, manifest: Manifest, top: float, height: float) -> None:  # noqa: ANN001
+    x, y = 0.012, top - 0.3 / height
+    title = f"{manifest.category}  {manifest.split}"
+    words = [figure.text(x, y, title, fontsize=11, weight="bold", color=INK)]
+    for p, name in enumerate(manifest.parts):
+        x += (words[-1].get_window_extent().width + 0.15 * DPI) / figure.bbox.width
+        color = PART_COLORS[p % len(PART_COLORS)]
+        words.append(figure.text(x, y, f"● {name}", fontsize=9, color=color))
+
+
+def _draw(axes: Axes, tile: Tile) -> None:
+    part = np.where(tile.part == UNLABELLED, -1, tile.part.astype(int))
+    draw_cloud(axes, tile.points, part, size=3.0)
+    for pivot, axis in zip(tile.pivot, tile.axis, strict=True):
+        draw_axis(axes, tile.points, pivot, axis, color=AXIS)
+    states = [
+        describe_state(float(state), joint.kind)
+        for joint, state in zip(tile.manifest.joints, tile.state, strict=True)
+    ]
+    axes.text(0.04, 0.03, f"{tile.number}", transform=axes.transAxes, fontsize=6, color=FAINT)
+    axes.text(
+        0.96, 0.03, "  ".join(states), transform=axes.transAxes, fontsize=6, color=FAINT, ha="right"
+    )

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""URDF models in: `reader.read` makes an `ArticulatedObject` of a file, `library` finds them."""

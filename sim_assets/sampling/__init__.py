@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""States, cameras and labelled clouds of one object: `samples`."""

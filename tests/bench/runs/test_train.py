@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: MIT
+"""train and predict as a user types them: files in, files out, the header says what was done."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bench.__main__ import main
+from bench.methods import METHODS, load
+from bench.runs.predict import to_arrays
+from bench.runs.train import pick_device, prepare
+from bench.scoring.predictions import Predictions, read_prediction_header
+from scapo.method import OracleMethod
+from scapo.paper.method import Scapo
+from scapo.store import open_split
+from scapo.store.files import read, read_header
+from scapo.store.schema import StoreError
+from scapo.types import Prediction
+from tests.helpers.hinged import plates
+from tests.helpers.splits import write_split
+
+SMALL = [
+    "--preset", "cpu", "--epochs", "1", "--batch", "4",
+    "--encoder.centres", "16", "--encoder.neighbours", "6", "--encoder.width", "6",
+    "--decoder.points", "64", "--decoder.widths", "16", "16", "8",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two splits of plates in the layout of CONTRACT 3."""
+    folder = tmp_path_factory.mktemp("data")
+    for split, count in (("train", 12), ("test", 5)):
+        observation, labels = plates(count, 64, seed=count)
+        assert labels.camera_T_part is not None
+        assert labels.joints is not None
+        assert labels.part is not None
+        change = {
+            "points": observation.points.numpy(),
+            "part": labels.part.numpy().astype(np.uint8),
+            "camera_T_part": labels.camera_T_part.numpy(),
+            "joint_pivot": labels.joints.pivot.numpy(),
+            "joint_axis": labels.joints.axis.numpy(),
+            "joint_state": labels.joints.state.numpy(),
+        }
+        write_split(
+            folder / "laptop" / split, split=split, counts=(count,), change=change, points=64
+        )
+    return folder
+
+
+def command(*words: object) -> None:
+    main([str(word) for word in words])
+
+
+@pytest.fixture(scope="module")
+def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "scapo"
+    command("train", "scapo", "--category", "laptop", "--data", data, "--out", out, "--device",
+            "cpu", *SMALL)  # fmt: skip
+    return out
+
+
+def test_the_run_is_that_of_the_flags(run: Path) -> None:
+    config = read_header(run / "checkpoint.safetensors")["config"]
+    assert config["preset"] == "cpu"
+    assert config["epochs"] == [1]
+    assert config["encoder"]["centres"] == 16
+    assert config["loss"]["recon_form"] == "partial"
+    method, header = load(run)
+    assert isinstance(method, Scapo)
+    assert not method.training
+    assert header["category"] == "laptop"
+
+
+def test_the_flags_of_speed_reach_the_run(data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command("train", "scapo", "--category", "laptop", "--data", data, "--out", out, "--device",
+            "cpu", *SMALL, "--precision", "bfloat16", "--no-tf32", "--no-pictures")  # fmt: skip
+    training = read_header(out / "checkpoint.safetensors")["training"]
+    assert training == {
+        "precision": "bfloat16",
+        "compiled": False,
+        "tf32": False,
+        "clip": 10.0,
+        "ranks": 1,
+    }
+    assert (out / "report.html").is_file()
+    assert not (out / "pictures").exists()
+
+
+def test_resume_leaves_a_finished_run(run: Path, data: Path) -> None:
+    before = (run / "checkpoint.safetensors").read_bytes()
+    command("train", "scapo", "--category", "laptop", "--data", data, "--out", run, "--device",
+            "cpu", *SMALL, "--resume")  # fmt: skip
+    assert (run / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "p.safetensors"
+    command("predict", run, "--data", data, "--out", out, "--device", "cpu", "--batch", "2")
+    split = open_split(data, "laptop", "test")
+    with Predictions(out, split) as predictions:
+        rows = predictions.rows(0, 5)
+        predictions.finish()
+    assert rows["part_weight"].shape == (5, 64, 2)
+    header = read_prediction_header(out)
+    assert (header.method, header.variant, header.supervision) == ("scapo", "cpu", ())
+    assert header.data_digest == split.manifest.digest
+    assert header.budget["parameters"] > 1000
+    assert header.budget["training_seconds"] > 0
+    trained = read_header(run / "checkpoint.safetensors")
+    for name in ("commit", "config", "machine", "data_digest", "training", "seed"):
+        assert header.run[name] == trained[name], name
+    one = tmp_path / "one.safetensors"
+    command("predict", run, "--data", data, "--out", one, "--device", "cpu", "--batch", "5")
+    for name, value in read(one)[0].items():
+        np.testing.assert_allclose(value, read(out)[0][name], atol=1e-4)
+
+
+def test_icp_with_and_without_its_oracle(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "icp"
+    command("train", "icp", "--category", "laptop", "--data", data, "--out", run, "--templates", 2)
+    for words, variant in (((), ""), (("--oracle",), "oracle-segmentation")):
+        out = tmp_path / f"{variant}p.safetensors"
+        command("predict", run, "--data", data, "--out", out, *words)
+        header = read_prediction_header(out)
+        assert (header.variant, header.supervision) == (variant, ("pose", "segmentation"))
+    assert (run / "metrics.jsonl").read_text() == ""
+
+
+def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    with pytest.raises(SystemExit) as caught:
+        command(*words)
+    assert caught.value.code == 1
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    return text
+
+
+def test_bad_input_is_one_line(
+    run: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", tmp_path / "x.safetensors"]
+    assert "expected a file, found none" in fails(
+        capsys, "predict", tmp_path / "none", "--data", data, *out
+    )
+    assert "--oracle: expected a method that takes one, found scapo" in fails(
+        capsys, "predict", run, "--data", data, *out, "--oracle"
+    )
+    assert "expected laptop/wrong" in fails(
+        capsys, "predict", run, "--data", data, *out, "--split", "wrong"
+    )
+    assert "expected one of laptop" in fails(
+        capsys, "train", "scapo", "--category", "teapot", "--data", data, *out
+    )
+    assert "--device cuda:99: expected a device of this machine" in fails(
+        capsys, "predict", run, "--data", data, *out, "--device", "cuda:99"
+    )
+
+
+def test_wrong_usage_ends_with_two() -> None:
+    for words in (["train"], ["train", "none"], ["train", "scapo", "--bogus", "1"], ["predict"]):
+        with pytest.raises(SystemExit) as caught:
+            command(*words)
+        assert caught.value.code == 2
+
+
+def test_flags_are_prepared_before_they_are_parsed() -> None:
+    words = ["train", "scapo", "--supervision=segmentation,joint", "--preset=cpu"]
+    assert prepare(words) == (
+        ["train", "scapo", "--supervision", "segmentation", "joint", "--preset", "cpu"],
+        "cpu",
+    )
+    assert prepare(["evaluate", "--x", "a,b"]) == (["evaluate", "--x", "a,b"], None)
+
+
+def test_presets_and_kinds() -> None:
+    entry = METHODS["scapo"]
+    assert entry.preset(None).preset == "paper"
+    assert entry.preset("cpu").preset == "cpu"
+    assert entry.preset("of another method") == entry.preset(None)
+    assert entry.kind is type(entry.preset("cpu"))
+
+
+def test_a_checkpoint_of_no_known_method_is_refused(run: Path, tmp_path: Path) -> None:
+    from scapo.store.files import write
+
+    arrays, header = read(run / "checkpoint.safetensors")
+    path = tmp_path / "c.safetensors"
+    write(path, arrays, {**header, "method": "magic"})
+    with pytest.raises(StoreError, match=r"expected a method of scapo, .*icp.*, found 'magic'"):
+        load(path)
+
+
+def test_devices() -> None:
+    assert pick_device("cpu") == "cpu"
+    assert pick_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def test_what_is_not_predicted_is_left_out() -> None:
+    arrays = to_arrays(Prediction(part_weight=torch.ones(1, 2, 1), confidence=torch.ones(1)))
+    assert {name: array.dtype.name for name, array in arrays.items()} == {
+        "part_weight": "float32",
+        "confidence_sample": "float32",
+    }
+
+
+def test_only_oracle_methods_are_shown_labels() -> None:
+    assert not issubclass(Scapo, OracleMethod)
+    assert "predict_given" in OracleMethod.__abstractmethods__

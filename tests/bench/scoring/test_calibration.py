@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: MIT
+"""Calibration through files, and the published evaluator on files."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from bench.compat.readings import opalign
+from bench.scoring.compat_files import check_record
+from bench.scoring.evaluate import Request, evaluate
+from bench.scoring.predictions import write_predictions
+from bench.scoring.scores import Settings
+from scapo import categories
+from scapo.store import Split, StoreError
+from tests.helpers import made
+from tests.helpers.scoring import root, score
+
+CATEGORIES = ("laptop", "eyeglasses", "drawer")
+
+
+@pytest.fixture(scope="module", params=CATEGORIES)
+def split(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    return made.make_data(folder, request.param, count=11, train=30, points=48, background=4)
+
+
+@pytest.fixture(scope="module")
+def laptop(tmp_path_factory):
+    return made.make_data(tmp_path_factory.mktemp("data"), "laptop", count=11, train=30, points=48)
+
+
+def own_frames(split, seed):
+    """The truth in hidden canonical frames and states, parts swapped in some samples where the
+    category's symmetry makes that the same object."""
+    generator = np.random.default_rng(seed)
+    arrays = made.truth_as_prediction(split)
+    category = categories.category(split.manifest.category)
+    parts = len(category.parts)
+    hidden = np.random.default_rng(42)
+    frames = np.tile(np.eye(4), (parts, 1, 1))
+    frames[:, :3, :3] = made.rotations(hidden, parts)
+    frames[:, :3, 3] = hidden.normal(scale=0.2, size=(parts, 3))
+    points = split.arrays("points")["points"].astype(np.float64)
+    scale = 4 * np.linalg.norm(points - points.mean(1, keepdims=True), axis=-1).mean(1)
+    pose = arrays["camera_T_part"].astype(np.float64)
+    part = arrays["part"].astype(np.int64)
+    if category.symmetry is not None:
+        swapped = generator.random(len(part)) < 0.4
+        order = np.array([1, 0] if parts == 2 else [0, 2, 1])
+        turn = np.eye(4)
+        turn[:3, :3] = category.symmetry
+        pose[swapped] = pose[swapped][:, order] @ turn
+        known = part[swapped] != 255
+        part[swapped] = np.where(known, order[np.where(known, part[swapped], 0)], 255)
+        if parts == 3:
+            for name in ("joint_pivot", "joint_axis", "joint_state"):
+                arrays[name][swapped] = arrays[name][swapped][:, ::-1]
+        else:  # the child is the true base: it moves the other way
+            arrays["joint_axis"][swapped] *= -1
+    metric = np.broadcast_to(frames, pose.shape).copy()
+    metric[..., :3, 3] *= scale[:, None, None]
+    pose = pose @ np.linalg.inv(metric)
+    turns = np.array([joint.kind == "revolute" for joint in category.joints])
+    shift = np.where(turns, 0.7, 0.3 * scale[:, None])
+    state = arrays["joint_state"] + shift
+    flipped = generator.random(len(part)) < 0.5  # an axis may point either way
+    arrays["joint_axis"][flipped] *= -1
+    state[flipped] *= -1
+    return arrays | {
+        "part": part.astype(np.uint8),
+        "camera_T_part": pose.astype(np.float32),
+        "joint_state": state.astype(np.float32),
+    }
+
+
+def test_calibration_finds_hidden_frames_and_states(split, tmp_path):
+    train = Split(root(split) / split.manifest.category / "train")
+    calibration = own_frames(train, 1)
+    generator = np.random.default_rng(0)
+    calibration["camera_T_part"][:6, :, :3, :3] = (
+        made.rotations(generator, 6)[:, None]
+    )  # fmt: skip
+    calibration["camera_T_part"][6] = np.nan
+    arrays = own_frames(split, 2)
+    errors, report = score(split, arrays, tmp_path, calibration)
+    np.testing.assert_array_equal(errors["iou", "1"], 1)
+    np.testing.assert_allclose(errors["part_rotation", "deg"], 0, atol=1e-3)
+    np.testing.assert_allclose(errors["part_translation", "r4"], 0, atol=1e-5)
+    for key, value in errors.items():
+        if key[0] == "joint_state":
+            np.testing.assert_allclose(value, 0, atol=1e-3)
+    found = report["calibration"]
+    assert found["samples"] == 30
+    assert found["answered"] == [29] * len(split.manifest.parts)
+    assert min(found["rotation_inlier_ratio"]) >= 23 / 29 - 1e-9
+    uncalibrated, _ = score(split, arrays, tmp_path)
+    assert uncalibrated["part_rotation", "deg"].mean() > 20
+
+
+def test_calibration_on_tested_or_foreign_predictions_is_refused(laptop, tmp_path):
+    path = made.write_truth(tmp_path / "p.safetensors", laptop)
+    train = Split(root(laptop) / "laptop" / "train")
+    request = Request(predictions=path, data=root(laptop), out=tmp_path / "s.csv.gz",
+                      calibration=path)  # fmt: skip
+    with pytest.raises(StoreError, match=r"expected predictions on the split 'train' for "
+                                         r"calibration, found split 'test'"):  # fmt: skip
+        evaluate(request)
+    # A header that claims the training split, over the tested data.
+    sly = tmp_path / "sly.safetensors"
+    write_predictions(sly, made.header_of(laptop, split="train"),
+                      made.truth_as_prediction(laptop))  # fmt: skip
+    with pytest.raises(StoreError, match="for calibration, found split 'train' with data digest"):
+        evaluate(dataclasses.replace(request, calibration=sly))
+    for field, value in (("method", "other"), ("variant", "v2"), ("seed", 2)):
+        other = made.write_truth(tmp_path / "o.safetensors", train, **{field: value})
+        with pytest.raises(StoreError, match=f"header field '{field}': expected"):
+            evaluate(dataclasses.replace(request, calibration=other))
+    foreign = made.write_truth(tmp_path / "f.safetensors", train, data_digest="1" * 64)
+    with pytest.raises(StoreError, match="header field 'data_digest': expected"):
+        evaluate(dataclasses.replace(request, calibration=foreign))
+
+
+def test_compat_needs_its_record(laptop, tmp_path):
+    settings = Settings(geometry="opalign-compat")
+    names = "record_R_select, record_T_select, record_S_joint"
+    with pytest.raises(StoreError, match=f"expected the tensors {names}.*, found none"):
+        score(laptop, made.truth_as_prediction(laptop), tmp_path, settings=settings)
+
+
+def test_the_message_names_what_is_missing(tmp_path):
+    names = ("record_R_select", "record_S_joint", "part")
+    with pytest.raises(StoreError, match=r"p: expected the tensors record_T_select, record_S_drct"):
+        check_record(tmp_path / "p", names)
+
+
+def network_record(split):
+    """A perfect OP-Align network: identity global rotation, canonical shape at its own states."""
+    arrays = split.arrays("points", "joint_pivot", "joint_axis", "joint_state")
+    points = arrays["points"].astype(np.float64)
+    centre = points.mean(1)
+    expand = 0.25 / np.linalg.norm(points - centre[:, None], axis=-1).mean(1)
+    count, joints = arrays["joint_state"].shape
+    pivot = (arrays["joint_pivot"] - centre[:, None]) * expand[:, None, None]
+    tilt = arrays["joint_axis"] + 0.05 * np.roll(arrays["joint_axis"], 1, -1)
+    angle = np.zeros((count, joints, 2))
+    angle[..., 1] = arrays["joint_state"]
+    return {f"record_{name}": value.astype(np.float32) for name, value in {
+        "R_select": np.tile(np.eye(3), (count, 1, 1)), "T_select": np.zeros((count, 3)),
+        "S_joint": pivot, "S_drct": arrays["joint_axis"], "S_angl": angle,
+        "I_joint": pivot, "I_drct": tilt, "I_angl": np.zeros_like(angle),
+    }.items()}  # fmt: skip
+
+
+def test_compat_through_files_equals_the_function(laptop, tmp_path):
+    train = Split(root(laptop) / "laptop" / "train")
+    settings = Settings(geometry="opalign-compat")
+    arrays = made.truth_as_prediction(laptop) | network_record(laptop)
+    calibration = made.truth_as_prediction(train) | network_record(train)
+    with pytest.raises(StoreError, match="expected --calibration"):
+        score(laptop, arrays, tmp_path, settings=settings)
+    errors, report = score(laptop, arrays, tmp_path, calibration, settings)
+    record = {"shape_type": "none", "n_train": 30, "ransac_seed": 1234,
+              "symmetry": np.diag([1, -1, -1])}  # fmt: skip
+    scales = []
+    for rows in (train, laptop):
+        raw = rows.arrays("points", "part", "camera_T_part", "joint_pivot", "joint_axis")
+        points = raw["points"].astype(np.float64)
+        centre = points.mean(1)
+        expand = 0.25 / np.linalg.norm(points - centre[:, None], axis=-1).mean(1)
+        pose = raw["camera_T_part"].astype(np.float64)
+        pose[..., :3, 3] = (pose[..., :3, 3] - centre[:, None]) * expand[:, None, None]
+        pivot = (raw["joint_pivot"] - centre[:, None]) * expand[:, None, None]
+        joint = np.concatenate([pivot, raw["joint_axis"]], -1)
+        one_hot = np.moveaxis(np.eye(2)[raw["part"]], -1, 1)
+        for name, value in (("gt_pose", pose), ("gt_joint", joint), ("pred_seg", one_hot),
+                            ("gt_seg", raw["part"].astype(np.int64))):  # fmt: skip
+            record.setdefault(name, []).append(value)
+        for name, value in network_record(rows).items():
+            record.setdefault(name.removeprefix("record_"), []).append(value)
+        scales.append(1 / expand)
+    joined = {k: np.concatenate(v) if isinstance(v, list) else v for k, v in record.items()}
+    expected = opalign(joined)
+    np.testing.assert_allclose(errors["part_rotation", "deg"], expected["rot_err_deg"], atol=1e-3)
+    np.testing.assert_allclose(errors["part_translation", "r4"], expected["trans_err"], atol=1e-5)
+    np.testing.assert_allclose(errors["joint_pivot", "r4"], expected["pivot_err"], atol=1e-5)
+    assert report["calibration"]["opalign"]["seed"] == 1234
+    metres = expected["trans_err"] * scales[1][:, None]
+    np.testing.assert_allclose(errors["part_translation", "m"], metres, atol=1e-5)

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: MIT
+"""The three tables: from scores on disk to text."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from bench import __main__ as program
+from bench.statistics import interval
+from bench.tables import write as tables
+from bench.tables.model import DASH
+from bench.tables.paper import check, printed_cells
+from bench.tables.precision import table_2
+from bench.tables.render import escape, to_csv, to_latex, to_markdown
+from bench.tables.results import Results, Series, load
+from bench.tables.rows import display_name, general_notes
+from bench.tables.significance import COLUMNS, significance_csv
+from bench.tables.spec import PRECISION_KEYS, TABLE_1_CATEGORIES, TABLE_2_CATEGORIES
+from tests.helpers.scored import OBJECTS, SAMPLES, make_scores
+
+
+@pytest.fixture(scope="module")
+def scores(tmp_path_factory):
+    """SCAPO with two seeds everywhere, ICP on laptops alone, a supervised method."""
+    folder = tmp_path_factory.mktemp("scores")
+    kept = {}
+    for kind, names in (("clean", TABLE_1_CATEGORIES), ("sensor", TABLE_2_CATEGORIES)):
+        for name in names:
+            for seed in (1, 2):
+                kept["scapo", kind, name, seed] = make_scores(folder, "scapo", name, seed=seed,
+                                                              kind=kind)  # fmt: skip
+    kept["icp"] = make_scores(folder, "icp", "laptop", quality=5, supervision=["segmentation"])
+    make_scores(folder, "gcn3d", "laptop", quality=0.1,
+                supervision=["pose", "segmentation", "joint"])  # fmt: skip
+    make_scores(folder, "scapo", "laptop", variant="wo_shape_var")
+    make_scores(folder, "scapo", "laptop", variant="[label-order=dataset]")
+    make_scores(folder, "constant", "laptop", quality=9,
+                supervision=["pose", "segmentation", "joint"])  # fmt: skip
+    return folder, kept
+
+
+@pytest.fixture(scope="module")
+def built(scores):
+    return tables.build(load(scores[0]))
+
+
+def rows_of(table, **wanted):
+    found = csv.DictReader(io.StringIO(to_csv(table)))
+    return [row for row in found if all(row[k] == v for k, v in wanted.items())]
+
+
+def one(table, **wanted):
+    (row,) = rows_of(table, **wanted)
+    return row
+
+
+def test_cells_are_means_over_samples_slots_and_seeds(scores, built):
+    kept = scores[1]
+    table = built[0]
+    blocks = {block.heading[0]: block.heading for block in table.blocks}
+    for symbol, key, factor in (("S", ("iou", "1"), 100), ("D", ("joint_direction", "deg"), 1),
+                                ("t", ("part_translation", "r4"), 1)):  # fmt: skip
+        means = []
+        for name in TABLE_1_CATEGORIES:
+            row = one(table, block=blocks[symbol], method="SCAPO", source="ours",
+                      column=name.capitalize())  # fmt: skip
+            values = [factor * kept["scapo", "clean", name, seed][key] for seed in (1, 2)]
+            joined = np.concatenate(values, 1)
+            means.append(np.nanmean(joined))
+            assert float(row["value"]) == pytest.approx(means[-1], rel=1e-6)
+            assert float(row["deviation"]) == pytest.approx(
+                np.std([np.nanmean(v) for v in values], ddof=1), rel=1e-4
+            )
+            assert int(row["n"]) == np.isfinite(joined).sum()
+            assert int(row["undefined"] or 0) == np.isnan(joined).sum()
+            assert float(row["low"]) < float(row["value"]) < float(row["high"])
+        mean = one(table, block=blocks[symbol], method="SCAPO", source="ours", column="Mean")
+        assert float(mean["value"]) == pytest.approx(np.mean(means), rel=1e-6)
+
+
+def test_intervals_are_resampled_by_instance(scores, built):
+    kept = scores[1]
+    table = built[0]
+    row = one(table, block=table.blocks[3].heading, method="ICP", source="ours", column="Laptop")
+    values = kept["icp"]["part_rotation", "deg"]
+    expected = interval(values, np.arange(SAMPLES) % OBJECTS)
+    assert float(row["low"]) == pytest.approx(expected.low, rel=1e-6)
+    assert float(row["high"]) == pytest.approx(expected.high, rel=1e-6)
+
+
+def test_what_was_not_run_is_a_dash_and_no_mean(built):
+    table = built[0]
+    heading = table.blocks[0].heading
+    assert one(table, block=heading, method="ICP", source="ours", column="Oven")["value"] == ""
+    assert one(table, block=heading, method="ICP", source="ours", column="Mean")["value"] == ""
+    text = to_markdown(table)
+    icp = next(line for line in text.splitlines() if "| ICP | ours" in line)
+    assert icp.count(DASH) == 5
+    assert f"| NPCS-EPN | paper | ✓ | ✓ | ✓ |{f' {DASH} |' * 6}" in text
+    assert "Oracle pose" in text
+    assert "Constant prediction" in text
+    assert "SCAPO, one part order" in text
+    assert "budget: device cpu, seconds 12.5; seeds 1, 2." in text
+
+
+def test_best_is_bold_among_the_self_supervised(built):
+    table = built[0]
+    for block in table.blocks[1:5]:
+        best = {
+            (row["method"], row["source"])
+            for row in rows_of(table, block=block.heading, column="Laptop", best="1")
+        }
+        assert ("3DGCN", "paper") not in best  # fully supervised
+        assert ("3DGCN", "ours") not in best
+        assert ("Constant prediction", "ours") not in best
+        assert ("ICP", "ours") not in best
+        assert {source for _, source in best} == {"paper", "ours"}
+    heading = table.blocks[1].heading
+    printed = rows_of(table, block=heading, column="Oven", best="1", source="paper")
+    assert [row["method"] for row in printed] == ["OP-Align"]  # 4.41 against SCAPO's 4.70
+
+
+def test_the_papers_tables_from_the_same_code():
+    """Without scores: every printed cell, in the paper's places."""
+    one_, two, three, _ = tables.build(Results([]))
+    cells = printed_cells()
+    seen = [
+        cell.text
+        for table in (one_, two, three)
+        for block in table.blocks
+        for row in block.rows
+        for cell in row.cells
+        if cell.text is not None
+    ]
+    assert sorted(seen) == sorted(cell.text for cell in cells.values())
+    flagged = [row for table in (one_, two) for row in rows_of(table, printed_mean_mismatch="1")]
+    assert len(flagged) == 20
+    assert all(row["column"] == "Mean" or row["block"] == "Mean" for row in flagged)
+    scapo = one(one_, block=one_.blocks[0].heading, method="SCAPO", source="paper", column="Mean")
+    assert scapo["value"] == "84.98"
+    basket = one(two, block="Basket", method="SCAPO", source="paper", column="Joint 10°10cm")
+    assert basket["value"] == "93.32"
+    ablation = rows_of(three, method="w/o L_joint-prox", source="paper")
+    assert [row["value"] for row in ablation] == ["82.77", "4.73", "0.137"]
+
+
+def test_precision_is_k_of_n_and_monotone(scores, built):
+    folder, kept = scores
+    for rule in ("mean", "min", "per-part"):
+        table = tables.build(load(folder), rule)[1]
+        for name in TABLE_2_CATEGORIES:
+            rows = rows_of(table, block=name.capitalize(), method="SCAPO", source="ours")
+            counts = []
+            for row, key in zip(rows, PRECISION_KEYS, strict=False):
+                k, n = int(row["k"]), int(row["n"])
+                slots = 1
+                if rule == "per-part":
+                    parts = 3 if name == "basket" else 2
+                    slots = parts - 1 if key.startswith("joint") else parts
+                assert n == 2 * SAMPLES * slots
+                assert float(row["value"]) == pytest.approx(100 * k / n)
+                counts.append(k)
+            assert counts[0] <= counts[1]
+            assert counts[2:5] == sorted(counts[2:5])
+            assert counts[5:8] == sorted(counts[5:8])
+    first = one(built[1], block="Drawer", method="SCAPO", source="ours",
+                column="Part 10°10cm")  # fmt: skip
+    passed = 0
+    for seed in (1, 2):
+        errors = kept["scapo", "sensor", "drawer", seed]
+        turn = errors["part_rotation", "deg"].mean(1) < 10
+        passed += (turn & (errors["part_translation", "m"].mean(1) < 0.1)).sum()
+    assert int(first["k"]) == passed
+
+
+def test_mean_errors_of_all_other_categories(scores, built, tmp_path):
+    kept = scores[1]
+    table = built[3]
+    assert table.columns == tuple(f"{name.capitalize()} (sensor)" for name in TABLE_2_CATEGORIES)
+    row = one(table, block=table.blocks[1].heading, method="SCAPO", column="Drawer (sensor)")
+    values = [kept["scapo", "sensor", "drawer", s]["joint_direction", "deg"] for s in (1, 2)]
+    assert float(row["value"]) == pytest.approx(np.mean(values), rel=1e-6)
+    make_scores(tmp_path, "scapo", "basket")
+    assert tables.build(load(tmp_path))[3].columns[-2:] == ("Suitcase (sensor)", "Basket (clean)")
+
+
+def test_ablations_by_the_end_of_the_variant(built):
+    table = built[2]
+    ours = [row for row in table.blocks[0].rows if row.source == "ours"]
+    assert [row.method for row in ours] == ["Full", "w/o L_shape-var (wo_shape_var)"]
+    assert ours[0].cells[0].value is not None
+    assert ours[1].cells[0].value is None  # one category is no mean
+
+
+def test_significance(scores, tmp_path):
+    folder, kept = scores
+    tables.write(load(folder), tmp_path)
+    text = (tmp_path / "significance.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    row = next(r for r in rows if (r["first"], r["second"], r["metric"]) ==
+               ("icp", "scapo", "joint_direction"))  # fmt: skip
+    scapo = [kept["scapo", "clean", "laptop", seed]["joint_direction", "deg"] for seed in (1, 2)]
+    difference = np.mean(scapo, 0) - kept["icp"]["joint_direction", "deg"]
+    assert float(row["difference"]) == pytest.approx(difference.mean(), rel=1e-5)
+    assert float(row["p_value"]) < 0.05
+    assert int(row["samples"]) == SAMPLES
+
+
+def test_latex_compiles_and_golden(scores, tmp_path, repository, update_golden):
+    table = tables.table_3(Results([]), printed_cells())
+    golden = repository / "tests" / "golden" / "table3.tex"
+    text = to_latex(table)
+    if update_golden:
+        golden.write_text(text)
+    assert text == golden.read_text()
+    program_ = shutil.which("pdflatex")
+    if program_ is None:
+        pytest.skip("no pdflatex on this machine")
+    folder, _ = scores
+    tables.write(load(folder), tmp_path)
+    for number in (1, 2, 3, 4):
+        command = [program_, "-interaction=nonstopmode", "-halt-on-error", f"table{number}.tex"]
+        done = subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False
+        )
+        if "not found" in done.stdout:
+            pytest.skip("a LaTeX package is missing on this machine")
+        assert done.returncode == 0, done.stdout[-2000:]
+        assert (tmp_path / f"table{number}.pdf").stat().st_size > 1000
+
+
+def test_names_of_rows():
+    assert display_name(Series("scapo", "", "")) == "SCAPO"
+    assert display_name(Series("scapo", "cpu", "label-order=dataset")) == (
+        "SCAPO (cpu), one part order"
+    )
+    assert display_name(Series("mine", "default", "iou=soft")) == "mine, iou=soft"
+
+
+def test_notes_are_under_every_table():
+    for table in tables.build(Results([])):
+        assert set(general_notes()) <= set(table.notes)
+        assert all(note in to_markdown(table) for note in general_notes())
+
+
+def test_one_method_alone_has_no_comparison(tmp_path):
+    make_scores(tmp_path, "scapo", "drawer", kind="sensor")
+    results = load(tmp_path)
+    assert significance_csv(results).splitlines() == [",".join(COLUMNS)]
+    cells = table_2(results, printed_cells(), [], "mean")
+    row = one(cells, block="Drawer", method="SCAPO", source="ours", column="State")
+    assert row["value"] != ""
+
+
+def test_names_cannot_break_latex():
+    assert escape(r"50% of_$x & {y}~#\^") == (
+        r"50\% of\_\$x \& \{y\}\textasciitilde{}\#\textbackslash{}\textasciicircum{}"
+    )
+    assert escape("é") == "?"
+
+
+def test_without_the_json_the_numbers_are_the_same(scores, tmp_path):
+    folder, kept = scores
+    for path in folder.glob("clean-laptop-icp-*"):
+        shutil.copy(path, tmp_path)
+    for path in tmp_path.glob("*.json"):
+        path.unlink()
+    table = tables.build(load(tmp_path))[0]
+    row = one(table, block=table.blocks[3].heading, method="ICP", source="ours", column="Laptop")
+    assert float(row["value"]) == pytest.approx(kept["icp"]["part_rotation", "deg"].mean())
+    assert row["pose"] == ""  # its supervision is not known, so it is not ranked
+    assert row["best"] == "0"
+
+
+def test_the_commands(scores, tmp_path, capsys):
+    folder, _ = scores
+    program.main(["tables", "--scores", str(folder), "--out", str(tmp_path), "--ap-rule", "min"])
+    names = [f"table{n}.{suffix}" for n in (1, 2, 3, 4) for suffix in ("md", "csv", "tex")]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "significance.csv"])
+    capsys.readouterr()
+    program.main(["tables", "--check-paper"])
+    out = capsys.readouterr().out.splitlines()
+    assert out == check()
+    with pytest.raises(SystemExit) as ended:
+        program.main(["tables", "--scores", str(tmp_path / "none")])
+    assert ended.value.code == 1

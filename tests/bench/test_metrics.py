@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from bench.metrics import sample_errors, state_errors, state_sign
+from tests.helpers import made
+from tests.helpers.cases import KEYS, random_case
+
+SEEDS = st.integers(0, 2**31 - 1)
+
+
+def reference(case):
+    """One sample and slot at a time, by scipy and other formulas; identity order."""
+    batch, parts = case["camera_T_part_true"].shape[:2]
+    out = {key: np.zeros((batch, parts - ("joint" in key))) for key in KEYS}
+    for b in range(batch):
+        for p in range(parts):
+            here, there = case["part_true"][b] == p, case["part_pred"][b] == p
+            both, either = (here & there).sum(), (here | there).sum()
+            out["iou"][b, p] = both / either
+            true, pred = (case[f"camera_T_part_{k}"][b, p] for k in ("true", "pred"))
+            turn = Rotation.from_matrix(true[:3, :3].T @ pred[:3, :3])
+            out["part_rotation"][b, p] = np.degrees(turn.magnitude())
+            out["part_translation"][b, p] = np.sqrt(((true - pred)[:3, 3] ** 2).sum())
+        for j in range(parts - 1):
+            d, e = case["axis_true"][b, j], case["axis_pred"][b, j]
+            cosine = abs(d @ e) / np.sqrt(d @ d) / np.sqrt(e @ e)
+            out["joint_direction"][b, j] = np.degrees(np.arccos(min(1, cosine)))
+            r = case["pivot_pred"][b, j] - case["pivot_true"][b, j]
+            d = d / np.sqrt(d @ d)
+            out["joint_pivot"][b, j] = np.sqrt(max(0, r @ r - (r @ d) ** 2))
+    return out
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.sampled_from([2, 3]))
+def test_equals_an_independent_implementation(seed, parts):
+    case = random_case(seed, parts=parts)
+    found = sample_errors(**case)
+    kept = (found["order"] == np.arange(parts)).all(1)
+    for key, expected in reference(case).items():
+        np.testing.assert_allclose(found[key][kept], expected[kept], atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.sampled_from([2, 3]))
+def test_swapped_part_names_change_nothing(seed, parts):
+    """Predicted slots renamed by the allowed swap: the same errors, in the swapped slots."""
+    case = random_case(seed, parts=parts)
+    plain = sample_errors(**case)
+    swap = np.array([1, 0] if parts == 2 else [0, 2, 1])
+    joints = swap[1:] - 1 if parts == 3 else np.array([0])
+    renamed = case | {
+        "part_pred": swap[case["part_pred"]],
+        "camera_T_part_pred": case["camera_T_part_pred"][:, swap],
+        "pivot_pred": case["pivot_pred"][:, joints],
+        "axis_pred": case["axis_pred"][:, joints],
+    }
+    again = sample_errors(**renamed)
+    tie = (plain["order"] == again["order"]).all(1)  # equal accuracy: identity both times
+    for key in KEYS:
+        columns = joints if "joint" in key else swap
+        np.testing.assert_allclose(again[key][~tie][:, columns], plain[key][~tie], atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS)
+def test_a_rigid_motion_of_camera_and_truth_changes_nothing(seed):
+    case = random_case(seed, parts=3)
+    motion = np.eye(4)
+    motion[:3, :3] = made.rotations(np.random.default_rng(seed), 1)[0]
+    motion[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    moved: dict[str, Any] = dict(case)
+    for kind in ("true", "pred"):
+        moved[f"camera_T_part_{kind}"] = motion @ case[f"camera_T_part_{kind}"]
+        moved[f"pivot_{kind}"] = case[f"pivot_{kind}"] @ motion[:3, :3].T + motion[:3, 3]
+        moved[f"axis_{kind}"] = case[f"axis_{kind}"] @ motion[:3, :3].T
+    before, after = sample_errors(**case), sample_errors(**moved)
+    for key in KEYS:
+        np.testing.assert_allclose(after[key], before[key], atol=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.floats(0.01, 100))
+def test_scale_only_scales_lengths(seed, factor):
+    case = random_case(seed)
+    scaled = dict(case)
+    for kind in ("true", "pred"):
+        scaled[f"camera_T_part_{kind}"] = case[f"camera_T_part_{kind}"].copy()
+        scaled[f"camera_T_part_{kind}"][..., :3, 3] *= factor
+        scaled[f"pivot_{kind}"] = case[f"pivot_{kind}"] * factor
+    before, after = sample_errors(**case), sample_errors(**scaled)
+    for key in KEYS:
+        length = factor if key in ("joint_pivot", "part_translation") else 1
+        np.testing.assert_allclose(after[key], before[key] * length, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.sampled_from([2, 3]))
+def test_the_truth_is_perfect(seed, parts):
+    case = random_case(seed, parts=parts)
+    for name in ("camera_T_part", "pivot", "axis", "part"):
+        case[f"{name}_pred"] = case[f"{name}_true"]
+    found = sample_errors(**case)
+    np.testing.assert_array_equal(found["iou"], 1)
+    for key in KEYS[1:]:
+        np.testing.assert_allclose(found[key], 0, atol=1e-6)
+
+
+def test_truth_is_not_changed_in_place():
+    case = random_case(3)
+    kept = {key: value.copy() for key, value in case.items()}
+    case["part_pred"] = 1 - case["part_true"]
+    sample_errors(**case, symmetry=np.diag([1, -1, -1]))
+    for key in ("part_true", "camera_T_part_true", "pivot_true", "axis_true"):
+        np.testing.assert_array_equal(case[key], kept[key])
+
+
+def test_symmetry_turns_swapped_samples_only():
+    case = random_case(4, batch=4)
+    turn = np.diag([1.0, -1.0, -1.0])
+    case["part_pred"] = case["part_true"].copy()
+    case["part_pred"][:2] = 1 - case["part_true"][:2]
+    case["camera_T_part_pred"] = case["camera_T_part_true"].copy()
+    case["camera_T_part_pred"][:2] = case["camera_T_part_true"][:2, ::-1]
+    case["camera_T_part_pred"][:2, :, :3, :3] = (
+        case["camera_T_part_true"][:2, ::-1, :3, :3] @ turn
+    )  # fmt: skip
+    found = sample_errors(**case, symmetry=turn)
+    np.testing.assert_allclose(found["part_rotation"], 0, atol=1e-6)
+    np.testing.assert_array_equal(found["order"], [[1, 0], [1, 0], [0, 1], [0, 1]])
+    without = sample_errors(**case)
+    np.testing.assert_allclose(without["part_rotation"][:2], 180, atol=1e-5)
+
+
+def test_states_go_around_the_circle_and_follow_the_axis():
+    true = np.array([[0.1, 0.2]])
+    pred = np.array([[2 * np.pi + 0.3, -0.1]])
+    error = state_errors(state_true=true, state_pred=pred, revolute=np.array([True, False]),
+                         offset=np.array([0.0, 0.5]), sign=np.array([[1.0, -1.0]]))  # fmt: skip
+    np.testing.assert_allclose(error, [[0.2, 0.4]])
+    axis = np.array([[[0.0, 0, 1]], [[0.0, 0, 1]]])
+    sign = state_sign(axis, -axis, np.array([False, True]))
+    np.testing.assert_array_equal(sign, [[-1], [1]])
+    np.testing.assert_array_equal(state_sign(axis, None, np.array([True, False])), 1)

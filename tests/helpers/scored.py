@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: MIT
+"""Scores files with random errors, for tests of what reads them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bench.scoring.score_files import Run, side_file, write_report, write_rows, writing
+
+SAMPLES, OBJECTS = 40, 8
+
+
+def make_scores(
+    folder, method, category, *, seed=1, kind="clean", quality=1.0, supervision=(), variant="",
+    samples=SAMPLES, digest="0123456789ab",
+):  # fmt: skip
+    """A scores file with random errors; larger `quality` is worse."""
+    generator = np.random.default_rng([seed, len(category), len(method)])
+    parts = 3 if category in ("eyeglasses", "basket") else 2
+    metres = quality * generator.gamma(2, 0.03, size=(samples, parts))
+    errors = {
+        ("iou", "1"): generator.uniform(0.5, 1, size=(samples, parts)),
+        ("joint_direction", "deg"): quality * generator.gamma(2, 3, size=(samples, parts - 1)),
+        ("joint_pivot", "r4"): metres[:, 1:] * 3,
+        ("joint_pivot", "m"): metres[:, 1:],
+        ("joint_state", "deg"): generator.gamma(2, 3, size=(samples, parts - 1)),
+        ("part_rotation", "deg"): quality * generator.gamma(2, 4, size=(samples, parts)),
+        ("part_translation", "r4"): metres * 3,
+        ("part_translation", "m"): metres,
+    }
+    errors["iou", "1"][0] = np.nan
+    run = Run(method=method, variant=variant, seed=seed, data=f"{kind}@{digest}",
+              category=category, split="test")  # fmt: skip
+    path = folder / f"{kind}-{category}-{method}-{variant}-{seed}.csv.gz"
+    with writing(path) as stream:
+        write_rows(stream, run, 0, {key: value[:15] for key, value in errors.items()})
+        write_rows(stream, run, 15, {key: value[15:] for key, value in errors.items()})
+    write_report(side_file(path), {
+        "supervision": list(supervision), "instance": (np.arange(samples) % OBJECTS).tolist(),
+        "budget": {"device": "cpu", "seconds": 12.5},
+    })  # fmt: skip
+    return errors

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""Theta_E and Theta_D: pose moves with the cloud, the code does not; sizes as published."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+from torch.testing import assert_close
+
+from scapo.geometry.rigid import is_rotation
+from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig, gram_schmidt
+from scapo.paper.vector_neurons import initialise
+from tests.helpers.strategies import generator, normal, rotations
+
+SMALL = EncoderConfig(neighbours=8, centres=24, pool=60, width=6, branch=(8, 12, 8, 6), features=7)
+FORMS = {
+    "default": SMALL,
+    "all points": replace(SMALL, centres=None),
+    "mean edges": replace(SMALL, edge="mean"),
+    "gram-schmidt": replace(SMALL, projection="gram-schmidt"),
+    "length norm": replace(SMALL, norm="length"),
+}
+
+
+def encoder(config: EncoderConfig) -> Encoder:
+    made = Encoder(config)
+    initialise(made, generator(0))
+    with torch.no_grad():
+        for k in range(30):
+            made(0.2 * normal(k, 4, 60, 3, dtype=torch.float32))
+    return made.eval()
+
+
+def size(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_pose_moves_with_the_cloud_and_the_code_does_not(name: str) -> None:
+    made = encoder(FORMS[name]).double()
+    points, turn, shift = 0.2 * normal(9, 3, 60, 3), rotations(2, 3), normal(3, 3, 3)
+    before, after = made(points), made(points @ turn.mT + shift[:, None])
+    place = (turn @ before.translation[..., None])[..., 0] + shift
+    assert_close(after.frame, turn @ before.frame, atol=1e-8, rtol=0)
+    assert_close(after.rotation, turn @ before.rotation, atol=1e-8, rtol=0)
+    assert_close(after.translation, place, atol=1e-8, rtol=0)
+    assert_close(after.code, before.code, atol=1e-8, rtol=0)
+    assert bool(is_rotation(after.rotation, 1e-9).all())
+    assert (before.rotation - after.rotation).abs().max() > 0.1
+
+
+def test_in_single_precision_to_a_thousandth() -> None:
+    made = encoder(SMALL)
+    points = 0.2 * normal(9, 8, 60, 3, dtype=torch.float32)
+    turn, shift = rotations(2, 8, dtype=torch.float32), normal(3, 8, 3, dtype=torch.float32)
+    before, after = made(points), made(points @ turn.mT + shift[:, None])
+    assert_close(after.rotation, turn @ before.rotation, atol=1e-3, rtol=0)
+    place = (turn @ before.translation[..., None])[..., 0] + shift
+    assert_close(after.translation, place, atol=1e-3, rtol=0)
+    assert_close(after.code, before.code, atol=1e-3, rtol=1e-3)
+
+
+def test_the_code_tells_a_shape_from_its_mirror_image() -> None:
+    made = encoder(SMALL).double()
+    points = 0.2 * normal(9, 1, 60, 3)
+    mirrored = points * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    assert (made(points).code - made(mirrored).code).abs().max() > 1e-3
+
+
+def test_order_of_points_does_not_matter_where_all_are_centres() -> None:
+    made = encoder(FORMS["all points"]).double()
+    points = 0.2 * normal(9, 1, 60, 3)
+    shuffled = points[:, torch.randperm(60, generator=generator(1))]
+    assert_close(made(points).code, made(shuffled).code)
+    assert_close(made(points).rotation, made(shuffled).rotation)
+
+
+def test_align_and_place_are_inverse() -> None:
+    encoding = encoder(SMALL)(0.2 * normal(9, 2, 60, 3, dtype=torch.float32))
+    points = normal(4, 2, 5, 3, dtype=torch.float32)
+    assert_close(encoding.place(encoding.align(points)), points)
+    zero = torch.zeros(2, 1, 3)
+    assert_close(encoding.place(zero)[:, 0], encoding.translation)
+
+
+def test_gram_schmidt_keeps_the_first_axis() -> None:
+    frame = normal(1, 10, 3, 3)
+    found = gram_schmidt(frame)
+    assert bool(is_rotation(found, 1e-12).all())
+    first = frame[..., 0] / frame[..., 0].norm(dim=-1, keepdim=True)
+    assert_close(found[..., 0], first)
+
+
+def test_sizes_are_the_published_ones_within_three_percent() -> None:
+    made = Encoder(EncoderConfig())
+    assert size(made.pose) == 510
+    assert size(made) - 510 == pytest.approx(337_704, rel=0.03)
+    assert EncoderConfig().code == 1020
+    assert size(Decoder(DecoderConfig(), 1020)) == pytest.approx(13.6e6, rel=0.03)
+
+
+def test_the_decoder_gives_points_and_their_features() -> None:
+    made = Decoder(DecoderConfig(patches=3, points=12, widths=(7, 6, 5)), 9)
+    initialise(made, generator(0))
+    shape, features = made.eval()(normal(1, 2, 9, dtype=torch.float32))
+    assert shape.shape == (2, 12, 3)
+    assert features.shape == (2, 12, 5)
+    assert shape.abs().max() <= 1
+
+
+def test_a_patch_depends_on_its_own_weights_alone() -> None:
+    made = Decoder(DecoderConfig(patches=3, points=12, widths=(7, 6, 5)), 9)
+    initialise(made, generator(0))
+    made.eval()
+    code = normal(1, 2, 9, dtype=torch.float32)
+    before, _ = made(code)
+    with torch.no_grad():
+        made.out.weight[1] += 1
+    changed = (made(code)[0] - before).abs().amax((0, 2)) > 0
+    assert changed.tolist() == [False] * 4 + [True] * 4 + [False] * 4
+
+
+def test_batched_patches_equal_one_network_per_patch() -> None:
+    config = DecoderConfig(patches=2, points=6, widths=(7, 6, 5))
+    made = Decoder(config, 4)
+    initialise(made, generator(0))
+    made.eval()
+    code = normal(1, 1, 4, dtype=torch.float32)
+    shape, _ = made(code)
+    grid = made.grid[1, :, 2]  # third point of the second patch
+    x = made.from_code.weight.unflatten(0, (2, 7))[1] @ code[0]
+    x = x + made.from_grid.weight[1] @ grid + made.from_grid.bias[1, :, 0]
+    for number in range(3):
+        x = torch.relu(x / (1 + 1e-5) ** 0.5)  # batch norm as it starts
+        layer = made.hidden[number] if number < 2 else made.out
+        x = layer.weight[1] @ x + layer.bias[1, :, 0]  # pyright: ignore[reportIndexIssue]
+    assert_close(shape[0, 5], torch.tanh(x))
+
+
+def test_points_that_do_not_divide_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected points a multiple of 8 patches, found 1001"):
+        DecoderConfig(points=1001)

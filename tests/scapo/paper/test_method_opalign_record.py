@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: MIT
+"""The record's pose is the network's, in OP-Align's convention."""
+
+from __future__ import annotations
+
+import torch
+
+from scapo.geometry.points import normalise
+from scapo.paper.method import opalign_record
+from tests.helpers.tiny import tiny, tiny_data
+
+
+def test_its_pose_aligns_the_cloud_as_the_network_does() -> None:
+    points, _ = normalise(tiny_data(4).observation.points)
+    with torch.no_grad():
+        explanation = tiny().eval().explain(points)
+    record = opalign_record(explanation)
+    # Rows: R^T x - T of every point.
+    aligned = points @ record["R_select"] - record["T_select"][:, None]
+    assert torch.allclose(aligned, explanation.aligned, atol=1e-5)
+    assert torch.equal(record["S_joint"], explanation.joints.pivot)
+    assert torch.equal(record["I_angl"], explanation.template_joints.state)

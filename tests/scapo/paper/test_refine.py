@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""Refinement finds a known disturbance again, and never makes a fit worse."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from scapo.paper.refine import misfit, moved, refine
+from scapo.types import JointKind, Observation
+from tests.helpers.hinged import plates
+from tests.helpers.strategies import normal
+from tests.helpers.tiny import tiny
+from tests.scapo.paper.test_objectives import explanation
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_disturbed_explanation_is_put_right(kind: JointKind) -> None:
+    e = explanation(kind)
+    points = e.aligned
+    change = 0.08 * normal(1, 1, 6)
+    joint = torch.zeros(1, 1, 7, dtype=torch.float64)
+    joint[..., 6] = 0.15
+    wrong = moved(e, change, joint)
+    assert misfit(points, e, (kind,)).item() == pytest.approx(0, abs=1e-9)
+    before = misfit(points, wrong, (kind,)).item()
+    found = refine(points, wrong, (kind,), steps=80)
+    assert misfit(points, found, (kind,)).item() < 0.1 * before
+
+
+def test_nothing_changes_where_nothing_can_be_better() -> None:
+    e = explanation()
+    found = refine(e.aligned, e, ("revolute",), steps=5)
+    assert_close(found.encoding.rotation, e.encoding.rotation, atol=1e-6, rtol=0)
+    assert_close(found.joints.state, e.joints.state, atol=1e-6, rtol=0)
+
+
+def test_no_cloud_fits_worse_than_before() -> None:
+    model = tiny().eval()
+    points = plates(6, 96)[0].points
+    points = 0.25 * (points - points.mean(1, keepdim=True))
+    with torch.no_grad():
+        e = model.explain(points)
+        found = refine(points, e, model.kinds, steps=10)
+        assert bool((misfit(points, found, model.kinds) <= misfit(points, e, model.kinds)).all())
+
+
+def test_the_base_state_stays_fixed_and_axes_stay_unit() -> None:
+    e = explanation()
+    found = moved(e, torch.zeros(1, 6).double(), torch.ones(1, 1, 7).double())
+    assert found.joints.state[0, 0].tolist() == pytest.approx([0.0, 1.4])
+    assert found.joints.axis.norm().item() == pytest.approx(1)
+
+
+def test_predict_refines_on_demand_and_leaves_weights_alone() -> None:
+    model = tiny().eval()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    observation = Observation(points=plates(3, 96)[0].points)
+    fast, slow = model.predict(observation), model.predict(observation, "refine")
+    assert slow.joints is not None
+    assert fast.joints is not None
+    assert not torch.equal(slow.joints.pivot, fast.joints.pivot)
+    assert not slow.joints.pivot.requires_grad
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(parameter.grad is None for parameter in model.parameters())

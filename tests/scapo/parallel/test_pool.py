@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""Worker processes that fail, die and hang."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from scapo.parallel.pool import ONE_THREAD, Pool, _cause, describe_error
+
+
+def act(job: tuple[str, int], report) -> object:
+    """What the workers do here."""
+    verb, number = job
+    report(f"{verb} {number}", 1)
+    if verb == "raise":
+        raise ValueError(f"number {number}:\n expected less")
+    if verb == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if verb == "hang":
+        time.sleep(600)
+    if verb == "tick":
+        for _ in range(8):
+            time.sleep(0.25)
+            report("tick", 0)
+    if verb == "environment":
+        return {name: os.environ.get(name) for name in ONE_THREAD}
+    return number**2
+
+
+def test_a_job_that_fails_dies_or_hangs_costs_that_job_only():
+    jobs = [
+        ("square", 1),
+        ("raise", 2),
+        ("die", 3),
+        ("hang", 4),
+        ("exit", 5),
+        ("tick", 6),
+        ("environment", 7),
+        ("square", 8),
+    ]
+    heard: list[tuple[str, int]] = []
+    with Pool(2, timeout=1.5) as pool:
+        outcomes = {
+            outcome.job: outcome
+            for outcome in pool.run(act, jobs, lambda job, label, n: heard.append((label, n)))
+        }
+        after = [outcome.result for outcome in pool.run(act, [("square", 9)])]
+        processes = [worker.process for worker in pool._workers]
+        assert any(process.is_alive() for process in processes)
+    assert not any(process.is_alive() for process in processes)
+    assert after == [81]
+    assert set(outcomes) == set(jobs)
+    assert [outcomes["square", n].result for n in (1, 8)] == [1, 64]
+    assert outcomes["tick", 6].result == 36  # two seconds, but with signs of life
+    failures = {job: (o.failure, o.reason, o.label) for job, o in outcomes.items() if o.failure}
+    assert failures == {
+        ("raise", 2): ("error", "number 2: expected less", "raise 2"),
+        ("die", 3): ("died", "its process was ended by SIGKILL", "die 3"),
+        ("hang", 4): ("hung", "no sign of life for 1.5 s", "hang 4"),
+    }
+    assert outcomes["environment", 7].result == dict.fromkeys(ONE_THREAD, "1")
+    assert ("square 1", 1) in heard
+
+
+def test_a_run_that_is_left_before_its_end_leaves_nothing_to_the_next():
+    with Pool(2) as pool:
+        for outcome in pool.run(act, [("square", 2), ("tick", 3), ("tick", 4)]):
+            assert outcome.result == 4
+            break
+        assert [outcome.result for outcome in pool.run(act, [("square", 5)])] == [25]
+
+
+def test_no_jobs_start_no_process():
+    with Pool(2) as pool:
+        assert list(pool.run(act, [])) == []
+        assert pool._workers == []
+
+
+def test_without_workers_jobs_are_done_here():
+    heard: list[str] = []
+    with Pool(0) as pool:
+        outcomes = list(
+            pool.run(act, [("square", 2), ("raise", 3)], lambda job, label, n: heard.append(label))
+        )
+    assert heard == ["square 2", "raise 3"]
+    assert outcomes[0].result == 4
+    assert (outcomes[1].failure, outcomes[1].label) == ("error", "raise 3")
+    assert outcomes[1].reason == "number 3: expected less"
+
+
+def test_a_negative_number_of_workers_is_refused():
+    with pytest.raises(ValueError, match="workers: expected 0 or more, found -1"):
+        Pool(-1)
+
+
+def test_how_a_process_ended():
+    assert _cause(7) == "its process ended with exit code 7"
+    assert _cause(-11) == "its process was ended by SIGSEGV"
+    assert _cause(None) == "its process ended with exit code None"
+
+
+def test_errors_in_one_line():
+    assert describe_error(ValueError("a:\n  b")) == "a: b"
+    assert describe_error(ZeroDivisionError("division by zero")) == (
+        "ZeroDivisionError: division by zero"
+    )
+    assert describe_error(KeyError("x")) == "KeyError: 'x'"
+    assert describe_error(MemoryError()) == "MemoryError"
+    assert describe_error(OSError(28, "No space left on device")) == (
+        "[Errno 28] No space left on device"
+    )

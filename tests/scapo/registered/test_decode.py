@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""Predictions from placements: metres, the camera frame, one joint motion between the parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from scapo.geometry.points import normalise
+from scapo.geometry.rigid import apply, invert, joint_motion, random_rotations
+from scapo.registered.decode import canonical_points, nearest_weights, placed_prediction, smoothed
+from scapo.registered.template import ArticulatedTemplate, Placement, slides
+from tests.helpers.sighted import sighted, template
+from tests.helpers.strategies import generator
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.2])
+@torch.no_grad()
+def test_parts_and_joint_of_a_prediction_belong_together(lean: float):
+    cloud = torch.randn(3, 50, 3, generator=generator(0)) + torch.tensor([0, 0, 4.0])
+    _, similarity = normalise(cloud)
+    rotation = random_rotations(3, generator(1))
+    state = torch.tensor([[0.2], [0.7], [1.1]])
+    placement = Placement.at(rotation, 0.1 * torch.randn(3, 3, generator=generator(2)), state)
+    placement = replace(placement, lean=lean * torch.randn(3, 1, 3, generator=generator(3)))
+    shape = template()
+    aside = torch.tensor([0.1, 0.2, -0.1])  # part frames sit at the base's middle, not the origin
+    shape.points.add_(aside)
+    shape.pivot.add_(aside)
+    if lean:
+        shape.rest.fill_(-0.3)
+        shape.load.fill_(0.1)
+    weight = torch.full((3, 50, 2), 0.5)
+    found = placed_prediction(shape, placement, weight, similarity, torch.ones(3))
+    assert found.camera_T_part is not None
+    assert found.joints is not None
+    base, lid = found.camera_T_part.unbind(1)
+    motion = joint_motion(
+        found.joints.pivot[:, 0], found.joints.axis[:, 0], found.joints.state[:, 0], "revolute"
+    )
+    assert_close(found.joints.state, state - shape.rest)
+    assert_close(lid, motion @ base, atol=1e-4, rtol=0)
+    centre = apply(base, shape.part_centres()[0].expand(3, 1, 3) * 0)
+    expected = similarity.inverse(
+        (rotation @ shape.part_centres()[0])[:, None] + placement.translation[:, None]
+    )
+    assert_close(centre, expected, atol=1e-5, rtol=1e-5)
+    assert_close(invert(base) @ base, torch.eye(4).expand(3, 4, 4), atol=1e-5, rtol=0)
+    assert found.canonical_points is not None  # what the poses map from
+    points = similarity.inverse(shape.place(placement)[0])
+    for part, pose in ((0, base), (1, lid)):
+        own = shape.logit.softmax(-1)[:, part] > 0.999
+        carried = apply(pose, found.canonical_points[:, own])
+        assert_close(carried, points[:, own], atol=2e-3, rtol=0)
+    still = canonical_points(shape, placement)
+    assert_close(still[0], still[2], atol=1e-6, rtol=0)
+
+
+def test_slides_are_marked():
+    shape = ArticulatedTemplate(("revolute", "prismatic"), 5)
+    assert slides(shape).tolist() == [[0.0], [1.0]]
+
+
+def test_weights_come_from_the_part_that_is_there():
+    views, truth = sighted(2, seed=70)
+    weight = nearest_weights(template(), views.points, truth, views.camera)
+    fine = nearest_weights(template(seed=9, count=3000), views.points, truth, views.camera)
+    assert (weight.argmax(-1) == fine.argmax(-1)).float().mean() > 0.95
+    assert_close(weight.sum(-1), torch.ones(2, views.points.shape[1]), atol=1e-5, rtol=0)
+
+
+def test_single_wrong_labels_are_outvoted():
+    g = generator(3)
+    target, source = torch.rand(1600, 2, generator=g), torch.rand(2000, 2, generator=g)
+    wrong = torch.rand(1600, generator=g) < 0.1
+    label = ((target[:, 0] >= 0.5) ^ wrong).long()
+    found = smoothed(source, target, torch.nn.functional.one_hot(label, 2).float())
+    assert_close(found.sum(-1), torch.ones(2000), atol=1e-5, rtol=0)
+    truth = (source[:, 0] >= 0.5).long()
+    single = label[torch.cdist(source, target).argmin(1)]
+    assert (single != truth).float().mean() > 0.08
+    assert (found.argmax(-1) != truth).float().mean() < 0.03
+
+
+def test_what_lies_on_a_target_far_from_others_is_its_own():
+    target = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
+    assert_close(smoothed(target, target, torch.eye(3)), torch.eye(3), atol=1e-6, rtol=0)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""The method: labels are withheld, a stored run predicts alike, predictions turn with the cloud."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from scapo.categories import CATEGORIES
+from scapo.geometry.points import squared_distances
+from scapo.geometry.rigid import invert, random_rotations, rotation_angle
+from scapo.method import Step
+from scapo.registered.initialisation import DiscoveryConfig
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.types import Labels, Observation, Prediction
+from tests.helpers.sighted import sighted, template
+from tests.helpers.strategies import generator
+
+
+def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
+    """The method with the true template and placements of 12 clouds, its network taught a bit."""
+    views, truth = sighted(12, seed=60)
+    cloud = views.points - views.camera[:, None]  # the camera at the origin
+    discovery = DiscoveryConfig(final_points=400)
+    config = RegisteredConfig(points=128, width=16, batch=12, discovery=discovery)
+    method = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    method.template.load_state_dict(template().state_dict())
+    camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
+    method.pseudo.set(cloud[:, 0], truth, camera, torch.ones(12))
+    method.pseudo.belonging = torch.ones(cloud.shape[:2], dtype=torch.bool)
+    observation = Observation(points=cloud)
+    optimiser = torch.optim.Adam(method.network.parameters(), 3e-3)
+    g = generator(1)
+    for step in range(steps):
+        terms = method.losses(
+            observation, Labels(), Step(stage="votes", progress=step / steps, generator=g)
+        )
+        optimiser.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()
+        optimiser.step()
+    return method.eval(), observation
+
+
+def test_predictions_turn_and_move_with_the_cloud_and_survive_storage():
+    method, observation = trained()
+    assert method.supervision == frozenset()
+    plain = method.predict(observation)
+    turn = random_rotations(1, generator(2))[0]
+    move = torch.tensor([0.3, -0.2, 0.5])
+    turned = method.predict(Observation(points=observation.points @ turn.T + move))
+    assert plain.camera_T_part is not None
+    assert turned.camera_T_part is not None
+    angles = rotation_angle(
+        turned.camera_T_part[:, 0, :3, :3], turn @ plain.camera_T_part[:, 0, :3, :3]
+    )
+    assert angles.rad2deg().median() < 1
+    other = RegisteredScapo(method.config, method.category, generator(5))
+    other.load_state_dict(method.state_dict())
+    again = other.eval().predict(observation)
+    assert_close(again.part_weight, plain.part_weight)
+
+
+def distance_to_template(prediction: Prediction, observation: Observation) -> Tensor:
+    """Mean distance of each cloud to its template, after the predicted part poses are undone."""
+    assert prediction.camera_T_part is not None
+    assert prediction.canonical_points is not None
+    part_T_camera = invert(prediction.camera_T_part)
+    part = prediction.part_weight.argmax(-1)
+    motion = part_T_camera[torch.arange(len(part))[:, None], part]
+    canonical = (motion[..., :3, :3] @ observation.points[..., None])[..., 0] + motion[..., :3, 3]
+    return squared_distances(canonical, prediction.canonical_points).sqrt().mean(-1)
+
+
+@pytest.mark.slow
+def test_refinement_brings_the_template_closer():
+    method, observation = trained(150)
+    refined = method.predict(observation, "refine")
+    fast = method.predict(observation)
+    after, before = (distance_to_template(one, observation) for one in (refined, fast))
+    assert after.median() < before.median()
+    assert torch.allclose(refined.part_weight.sum(-1), torch.tensor(1.0), atol=1e-4)
+
+
+def test_the_first_weights_come_from_the_seed_alone():
+    one, other = (
+        RegisteredScapo(RegisteredConfig(), CATEGORIES["oven"], generator(4)) for _ in range(2)
+    )
+    assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
+
+
+def test_one_stage_over_the_clouds_that_were_placed():
+    config = RegisteredConfig(epochs=3, learned=20)
+    made = RegisteredScapo(config, CATEGORIES["drawer"], generator(0))
+    (stage,) = made.stages()
+    assert (stage.name, stage.epochs, stage.clouds) == ("votes", 3, 20)
+    assert made.variant == ""
+    assert sum(p.numel() for p in made.parameters()) < 1_500_000
+
+
+def test_the_known_camera_moves_with_the_cloud():
+    method, observation = trained()
+    turn, move = random_rotations(1, generator(3))[0], torch.tensor([0.3, -0.2, 0.5])
+    moved = Observation(
+        points=observation.points @ turn.T + move, sensor=move.expand(len(observation.points), 3)
+    )
+    plain, turned = (method.predict(seen, "refine") for seen in (observation, moved))
+    assert plain.camera_T_part is not None
+    assert turned.camera_T_part is not None
+    expected = turn @ plain.camera_T_part[:, 0, :3, :3]
+    angles = rotation_angle(turned.camera_T_part[:, 0, :3, :3], expected).rad2deg()
+    assert angles.median() < 1
+
+
+def test_pictures_show_the_template_on_the_clouds():
+    method, observation = trained()
+    with torch.no_grad():
+        shown = method.pictures(Observation(points=observation.points[:3]), "votes")
+    assert {name: len(data.panels) for name, data in shown.items()} == {
+        "template": 3,
+        "canonical": 3,
+        "reconstruction": 3,
+    }
+    first = shown["reconstruction"].panels[0]
+    assert first.beneath is not None
+    gap = squared_distances(first.beneath[None], first.points[None]).sqrt()
+    assert gap.median() < 0.2

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+"""Parts from motion: points get the part whose motion other views confirm."""
+
+from __future__ import annotations
+
+import torch
+
+from scapo.registered.bundle_adjustment import oriented_nearest
+from scapo.registered.motion_segmentation import farthest_features, gather_evidence, rebuild, spread
+from scapo.registered.template import Placement
+from scapo.registered.views import Views
+from tests.helpers.sighted import sighted, template
+from tests.helpers.strategies import generator
+
+
+def true_parts(views: Views, truth: Placement) -> torch.Tensor:
+    """Of the views' points, from the true template."""
+    shape = template(seed=3, count=2000)
+    index = oriented_nearest(views.points, views.normals, *shape.place(truth))
+    return shape.logit.argmax(-1)[index]
+
+
+@torch.no_grad()
+def test_evidence_tells_the_parts():
+    views, truth = sighted(10, seed=20)
+    shape = template()
+    evidence = gather_evidence(
+        views, shape.part_poses(truth), truth.log_scale, count=96, observers=torch.arange(10)
+    )
+    score = spread(views, evidence.log_support - evidence.log_support.mean(-1, keepdim=True))
+    correct = score.argmax(-1) == true_parts(views, truth)[:, :96]
+    assert correct.float().mean() > 0.85
+
+
+def test_smoothing_keeps_a_constant():
+    views, _ = sighted(2, seed=21)
+    assert torch.allclose(spread(views, torch.full((2, 64, 2), 0.7)), torch.tensor(0.7), atol=1e-4)
+
+
+@torch.no_grad()
+def test_the_template_is_rebuilt_from_the_views():
+    views, truth = sighted(12, seed=22)
+    shape = template()
+    shape.points.data += 0.05 * torch.randn(400, 3, generator=generator(1))
+    shape.logit.zero_()
+    rebuild(shape, views, truth, generator=generator(2))
+    good = template(seed=5, count=3000)
+    off, index = torch.cdist(shape.points, good.points).min(-1)
+    assert off.quantile(0.9) < 0.04
+    parts = shape.logit.argmax(-1) == good.logit.argmax(-1)[index]
+    assert parts.float().mean() > 0.8
+
+
+def test_farthest_features_spread_out():
+    line = torch.arange(11.0)[:, None]
+    assert sorted(farthest_features(line, 3).tolist()) == [0, 5, 10]

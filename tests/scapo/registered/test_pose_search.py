@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""Search over rotations and states finds known placements; the margin tells the sure ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from scapo.geometry.rigid import rotation_angle
+from scapo.registered.joint_limits import OUTSIDE_COST, StateRange
+from scapo.registered.pairwise import rotation_grid
+from scapo.registered.pose_search import (
+    Found,
+    SearchSpace,
+    best_of,
+    search,
+    settle_states,
+    state_grid,
+)
+from scapo.registered.template import Placement
+from tests.helpers.sighted import sighted, template
+
+
+def test_known_placements_are_found():
+    views, truth = sighted(4, seed=40)
+    space = SearchSpace(
+        states=torch.linspace(0, 1, 4)[None], rotations=rotation_grid(700), cameras=None, keep=8
+    )
+    finalists = search(template(), views, space)
+    found = finalists.best()
+    errors = rotation_angle(found.placement.rotation, truth.rotation).rad2deg()
+    assert errors.median() < 8
+    assert (errors < 15).sum() >= 3
+    assert bool((found.margin[errors < 15] > 0.02).any())
+    state = (found.placement.state - truth.state).abs()[errors < 15]
+    assert state.max() < 0.2
+    high = StateRange(low=torch.tensor([3.0]), high=torch.tensor([4.0]), unit=torch.ones(1))
+    assert torch.allclose(finalists.best(high).loss, found.loss + OUTSIDE_COST)
+
+
+def test_a_wrong_state_is_corrected_and_the_rest_kept():
+    views, truth = sighted(4, seed=41)
+    wrong = replace(truth, state=(truth.state + 0.5) % 1.0)
+    found = Found(placement=wrong, loss=torch.zeros(4), margin=torch.zeros(4))
+    states = StateRange(low=torch.zeros(1), high=torch.ones(1), unit=torch.ones(1))
+    settled = settle_states(template(), views, found, states)
+    assert (settled.state - truth.state).abs().max() < 0.15
+    assert rotation_angle(settled.rotation, truth.rotation).rad2deg().max() < 8
+
+
+def test_all_combinations_of_states():
+    grid = state_grid(torch.tensor([[0.0, 1], [2, 3]]))
+    assert grid.tolist() == [[0, 2], [0, 3], [1, 2], [1, 3]]
+
+
+def test_the_best_and_its_margin():
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
+    rotation = torch.stack([torch.eye(3), turn, torch.eye(3), turn, turn, torch.eye(3)])
+    start = Placement.at(rotation, torch.zeros(6, 3), torch.arange(6.0)[:, None])
+    found = best_of(start, torch.tensor([0.3, 0.2, 0.5, 0.1, 0.15, 0.4]), 2)
+    assert found.placement.state[:, 0].tolist() == [1, 3]
+    assert torch.allclose(found.margin, torch.tensor([0.1, 0.3]))

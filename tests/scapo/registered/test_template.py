@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""The template's motions against the library's joint motion, for both kinds of joint."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import roma
+import torch
+from torch.testing import assert_close
+
+from scapo.geometry.rigid import apply, joint_motion, random_rotations, rigid
+from scapo.registered.template import ArticulatedTemplate, Placement, interleave, turn_placement
+from scapo.types import JointKind
+from tests.helpers.strategies import generator
+
+
+def drawn(kind: JointKind) -> tuple[ArticulatedTemplate, Placement]:
+    """A template and a placement with everything drawn."""
+    g = generator(6)
+    template = ArticulatedTemplate((kind,), 20)
+    points, normals = torch.randn(2, 20, 3, generator=g)
+    part = torch.nn.functional.one_hot(torch.arange(20) % 2, 2)
+    template.assign(points, torch.nn.functional.normalize(normals, dim=-1), 60.0 * part)
+    with torch.no_grad():
+        template.axis.copy_(torch.randn(1, 3, generator=g))
+        template.pivot.copy_(torch.randn(1, 3, generator=g))
+    return template, Placement(
+        rotation=random_rotations(4, g),
+        translation=torch.randn(4, 3, generator=g),
+        log_scale=0.2 * torch.randn(4, 3, generator=g),
+        state=torch.randn(4, 1, generator=g),
+        shift=torch.randn(4, 1, 3, generator=g),
+        lean=torch.zeros(4, 1, 3),
+    )
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@torch.no_grad()
+def test_parts_move_as_their_joint_says(kind: JointKind):
+    template, placement = drawn(kind)
+    points, normals = template.place(placement)
+    scaled = template.points * placement.log_scale.exp()[:, None]
+    axis = template.directions().expand(4, 3)
+    pivot = template.pivot * placement.log_scale.exp()
+    motion = joint_motion(pivot, axis, placement.state[:, 0], kind)
+    motion[:, :3, 3] += placement.shift[:, 0]
+    view_T_base = rigid(placement.rotation, placement.translation)
+    assert_close(points[:, ::2], apply(view_T_base, scaled[:, ::2]))
+    assert_close(points[:, 1::2], apply(view_T_base @ motion, scaled[:, 1::2]))
+    assert_close(normals.norm(dim=-1), torch.ones(4, 20))
+    seen, direction = template.joints_in_view(placement)
+    middle = template.part_centres()[1:] if kind == "prismatic" else template.pivot
+    spot = middle * placement.log_scale.exp() + placement.shift[:, 0]
+    assert_close(seen, apply(view_T_base, spot[:, None]))
+    assert_close(direction[:, 0], (placement.rotation @ axis[..., None])[..., 0])
+
+
+@torch.no_grad()
+def test_a_leaning_hinge_turns_its_part_about_its_own_axis_from_its_rest():
+    template, placement = drawn("revolute")
+    template.rest.copy_(torch.tensor([0.4]))
+    straight = replace(placement, shift=torch.zeros(4, 1, 3))
+    leaning = replace(straight, lean=0.2 * torch.randn(4, 1, 3, generator=generator(7)))
+    at_rest = torch.full((4, 1), 0.4)
+    still = template.part_poses(replace(leaning, state=at_rest))
+    upright = template.part_poses(replace(straight, state=at_rest))
+    assert_close(still.rotation, upright.rotation)
+    assert_close(still.translation, upright.translation)
+    pivot, axis = (x[:, 0] for x in template.joints_in_view(leaning))
+    onward = joint_motion(pivot, axis, (leaning.state - at_rest)[:, 0], "revolute")
+    moved = template.part_poses(leaning)
+    view_T_part = onward @ rigid(still.rotation[:, 1], still.translation[:, 1])
+    assert_close(rigid(moved.rotation[:, 1], moved.translation[:, 1]), view_T_part)
+    turned = roma.rotvec_to_rotmat(leaning.lean[:, 0]) @ template.directions()[0]
+    assert_close(axis, (leaning.rotation @ turned[..., None])[..., 0])
+
+
+def test_placements_are_taken_and_joined():
+    _, placement = drawn("revolute")
+    back = Placement.cat([placement.take(torch.tensor([2, 3])), placement.take(torch.tensor([0]))])
+    assert_close(back.state, placement.state[[2, 3, 0]])
+    assert_close(back.shift, placement.shift[[2, 3, 0]])
+
+
+def test_hypotheses_of_a_view_stand_together():
+    turn = torch.eye(3).expand(6, 3, 3)
+    pairs = Placement.at(turn, torch.zeros(6, 3), torch.arange(6.0)[:, None])
+    singles = Placement.at(turn[:3], torch.zeros(3, 3), 10 + torch.arange(3.0)[:, None])
+    mixed = interleave([pairs, singles], 3)
+    assert mixed.state[:, 0].tolist() == [0, 1, 10, 2, 3, 11, 4, 5, 12]
+
+
+@torch.no_grad()
+def test_a_turned_placement_turns_the_points():
+    template, placement = drawn("revolute")
+    turn = random_rotations(4, generator(9))
+    points, _ = template.place(turn_placement(placement, turn))
+    assert_close(points, template.place(placement)[0] @ turn.mT, atol=1e-4, rtol=1e-4)
+
+
+def test_a_lighter_template_has_the_first_points_and_the_same_joints():
+    template, placement = drawn("revolute")
+    light, repeated = template.with_points(8), template.with_points(50)
+    assert_close(light.place(placement)[0], template.place(placement)[0][:, :8])
+    assert_close(light.joints_in_view(placement), template.joints_in_view(placement))
+    assert torch.equal(repeated.points[20:40], template.points)
+
+
+def test_a_template_saved_without_leans_has_straight_hinges():
+    template, placement = drawn("revolute")
+    saved = {k: v for k, v in template.state_dict().items() if k not in ("rest", "load", "noise")}
+    back = ArticulatedTemplate(("revolute",), 20)
+    back.load_state_dict(saved)
+    assert not back.leans()
+    assert_close(back.place(placement), template.place(placement))

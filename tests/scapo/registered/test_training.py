@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: MIT
+"""The whole training of SCAPO as it works, on a few views: it repeats, resumes and predicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from scapo.categories import CATEGORIES
+from scapo.predictor import load
+from scapo.registered.initialisation import DiscoveryConfig
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.store.samples import TrainingData
+from scapo.training import fit
+from scapo.types import Labels, Observation
+from tests.helpers.sighted import sighted
+from tests.helpers.strategies import generator
+from tests.scapo.training.test_fit import InterruptedRunError, same
+
+DISCOVERY = DiscoveryConfig(
+    seeds=14, rotations=200, searched=14, trusted=(0.9,), starts=1, draws=2, heats=(0.8,), judged=4
+)
+CONFIG = RegisteredConfig(
+    discovery=DISCOVERY, learned=20, epochs=2, points=128, width=8, batch=8, grid_hypotheses=16
+)
+RUN = fit.FitConfig(log_every=1, checkpoint_every=0.0, pictures_every=None)
+
+
+def clouds(count: int) -> Observation:
+    """Views of a box with a flap, the camera at the origin."""
+    views, _ = sighted(count, seed=80)
+    return Observation(points=views.points - views.camera[:, None])
+
+
+def method(config: RegisteredConfig = CONFIG) -> RegisteredScapo:
+    return RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+
+
+@pytest.mark.slow
+def test_a_template_is_found_learned_and_stored(tmp_path: Path) -> None:
+    data = TrainingData(observation=clouds(20), labels=Labels(), digest="here")
+    fit.fit(method(), data, tmp_path / "whole", RUN)
+    found = load(tmp_path / "whole")
+    assert isinstance(found.model, RegisteredScapo)
+    template = found.model.template
+    assert (template.logit.argmax(-1) == 1).float().mean() > 0.1
+    assert found.model.pseudo.rotation.shape == (20, 3, 3)
+    one = found.predict(data.observation.points[0], "refine")
+    assert one.part_weight.shape == (data.observation.points.shape[1], 2)
+
+    def listener(progress: fit.Progress) -> None:
+        if progress.epoch == 1:
+            raise InterruptedRunError
+
+    with pytest.raises(InterruptedRunError):
+        fit.fit(method(), data, tmp_path / "cut", RUN, listener=listener)
+    fit.fit(method(), data, tmp_path / "cut", RUN, resume=True)
+    same(tmp_path / "whole", tmp_path / "cut")
+
+
+def test_too_few_clouds_are_refused() -> None:
+    made = method(replace(CONFIG, learned=7))
+    with pytest.raises(ValueError, match="training data: expected at least 8 clouds, found 5"):
+        made.start("votes", clouds(5), Labels(), torch.Generator().manual_seed(0))

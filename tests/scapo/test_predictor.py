@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""A trained model from disk answers as it did in memory, for one cloud or many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from torch.testing import assert_close
+
+from scapo.categories import CATEGORIES
+from scapo.predictor import load
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
+from scapo.store.schema import StoreError
+from scapo.types import Observation
+from tests.helpers.hinged import plates
+from tests.helpers.strategies import generator
+from tests.helpers.tiny import TINY, tiny
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    header = checkpoint_header("scapo", TINY, "laptop", {})
+    write_checkpoint(tmp_path / WEIGHTS, tiny(), header)
+    return tmp_path
+
+
+def test_answers_are_those_of_the_model(saved: Path) -> None:
+    points = plates(3, 96)[0].points
+    wanted = tiny().eval().predict(Observation(points=points))
+    many = load(saved).predict(points.numpy())
+    assert_close(many.part_weight, wanted.part_weight)
+    assert_close(many.camera_T_part, wanted.camera_T_part)
+    one = load(str(saved / WEIGHTS)).predict(points[0])
+    assert one.part_weight.shape == (96, 2)
+    assert one.joints is not None
+    assert wanted.joints is not None
+    assert_close(one.joints.pivot, wanted.joints.pivot[0])
+    nested = load(saved).predict(points.numpy().reshape(3, 1, 96, 3))
+    assert nested.part_weight.shape == (3, 1, 96, 2)
+
+
+@pytest.mark.parametrize("shape", [(3,), (96, 2), (4, 3)])
+def test_other_shapes_are_refused(saved: Path, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"points: expected shape \(..., N, 3\) with N at least 6"):
+        load(saved).predict(np.zeros(shape, np.float32))
+
+
+def test_values_that_are_not_finite_are_refused(saved: Path) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        load(saved).predict(np.full((96, 3), np.nan, np.float32))
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="nowhere: expected a run folder, a checkpoint or a cat"):
+        load("nowhere")
+    write_checkpoint(tmp_path / WEIGHTS, tiny(), checkpoint_header("other", TINY, "laptop", {}))
+    with pytest.raises(StoreError, match="expected method 'scapo' or 'registered', found 'other'"):
+        load(tmp_path)
+
+
+def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
+    config = RegisteredConfig(points=64, width=8)
+    model = RegisteredScapo(config, CATEGORIES["laptop"], generator(0)).eval()
+    write_checkpoint(
+        tmp_path / WEIGHTS, model, checkpoint_header("registered", config, "laptop", {})
+    )
+    points = plates(2, 96)[0].points
+    wanted = model.predict(Observation(points=points))
+    found = load(tmp_path).predict(points, sensor=np.zeros(3))
+    assert_close(found.part_weight, wanted.part_weight)
+    assert_close(found.camera_T_part, wanted.camera_T_part)
+    one = load(tmp_path).predict(points[0].double().numpy())
+    assert_close(one.part_weight, wanted.part_weight[0])
+    assert found.confidence is not None
+    assert_close(one.confidence, found.confidence[0])
+    few = load(tmp_path).predict(points[:, :40])
+    assert few.part_weight.shape == (2, 40, 2)
+    with pytest.raises(ValueError, match="at least one cloud, found"):
+        load(tmp_path).predict(np.zeros((0, 96, 3)))

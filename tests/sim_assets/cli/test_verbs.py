@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: MIT
+"""`scapo-data` as a user meets it: help, exit codes, one-line errors, what is printed and drawn."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from scapo.categories import CATEGORIES
+from sim_assets.__main__ import main
+from sim_assets.cli import verbs
+from sim_assets.cli.console import RateColumn, progress_bar, watched
+from sim_assets.cli.verbs import VERBS
+from sim_assets.describe.info import describe_state, histogram
+from sim_assets.inspect.preview import draw_preview
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    code = ended.value.code
+    assert isinstance(code, int)
+    return code
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    """A small data set of two splits, made by the command itself."""
+    out = tmp_path_factory.mktemp("data")
+    common = ("--protocol", "full", "--points", 128, "--workers", 0, "--out", out)
+    assert run("generate", "laptop", "--count", 20, "--instances", 4, *common) == 0
+    assert run("generate", "oven", "--count", 6, "--split", "test", *common) == 0
+    return out
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_of_every_verb_says_what_each_flag_does(verb, capsys):
+    assert run(verb, "--help") == 0
+    text = capsys.readouterr().out
+    assert f"scapo-data {verb}" in text
+    assert "--help" in text
+
+
+def test_generate_has_the_flags_of_the_contract(capsys):
+    run("generate", "--help")
+    text = capsys.readouterr().out
+    text = " ".join(text.split())
+    flags = """out source up front scale split count instances seed points protocol noise backend
+        image-size sampling color states-per-view workers engine strict"""
+    for flag in flags.split():
+        assert f"--{flag} " in text, flag
+    assert set(get_args(verbs.Name)) == set(CATEGORIES)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (),
+        ("bogus",),
+        ("generate",),
+        ("generate", "laptop"),
+        ("generate", "chair", "--out", "x"),
+        ("generate", "laptop", "--out", "x", "--bogus", "1"),
+        ("generate", "laptop", "--out", "x", "--count", "many"),
+        ("generate", "laptop", "--out", "x", "--noise", "loud"),
+        ("info",),
+        ("preview", "x"),
+        ("check", "x", "--bogus"),
+    ],
+)
+def test_wrong_usage_ends_2(arguments, capsys):
+    assert run(*arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("generate", "laptop", "--count", 0), "count: expected 1 or more, found 0"),
+        (("generate", "laptop", "--source", "/no/such"), "/no/such: expected a folder"),
+        (("generate", "laptop", "--workers", -1), "workers: expected 0 or more, found -1"),
+        (("info", "/no/such"), "/no/such: expected a data set (manifest.json), found none"),
+        (("check", "/no/such"), "/no/such: expected a folder or a .urdf file, found nothing"),
+        (("build", "laptop", "--count", 0), "count: expected at least 1, found 0"),
+    ],
+)
+def test_bad_input_ends_1_with_one_line(arguments, message, tmp_path, capsys):
+    out = () if arguments[0] in ("info", "check") else ("--out", tmp_path / "out")
+    assert run(*arguments, *out) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"scapo-data: {message}")
+
+
+def test_generate_prints_a_summary_and_says_when_all_is_there(data, capsys):
+    flags = ("--protocol", "full", "--points", 128, "--workers", 0, "--out", data)
+    assert run("generate", "laptop", "--count", 20, "--instances", 4, *flags) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "laptop/train: 20 samples of 4 objects, there already, whole"
+    assert lines[1] == "views redrawn: 0.00 %"
+    manifest = json.loads((data / "laptop/train/manifest.json").read_text())
+    assert lines[2] == f"digest {manifest['digest']}"
+    assert lines[3].split()[1] == manifest["plan_digest"]
+    assert run("generate", "laptop", "--count", 21, "--instances", 4, *flags) == 1
+    assert "count 20, found count 21; choose another folder" in capsys.readouterr().err
+
+
+def test_generate_names_the_models_it_left_out(tmp_path, capsys):
+    assert run("build", "laptop", "--out", tmp_path / "models", "--count", 3) == 0
+    bad = sorted((tmp_path / "models/laptop").glob("*/mobility.urdf"))[1]
+    bad.write_text("<robot/>")
+    flags = ("--protocol", "full", "--workers", 0, "--points", 64, "--count", 4)
+    source = tmp_path / "models/laptop"
+    code = run("generate", "laptop", "--source", source, "--out", tmp_path / "data", *flags)
+    assert code == 1
+    text = capsys.readouterr().out
+    assert "laptop/train: 4 samples of 2 objects" in text
+    assert f"left out {bad.parent.name}" in text
+    code = run(
+        "generate", "laptop", "--source", source, "--out", tmp_path / "b", "--strict", *flags
+    )
+    assert code == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_info_tells_counts_ranges_and_damage(data, tmp_path, capsys):
+    assert run("info", data) == 0
+    text = capsys.readouterr().out
+    for piece in (
+        "laptop (base, screen), split train",
+        "20 of 128 points, 4 objects, seed 1",
+        "oven (body, door), split test",
+        "protocol full",
+        "azimuth",
+        "points on screen",
+        "5 to 5 samples",
+        "all whole",
+    ):
+        assert piece in text, piece
+    copy = tmp_path / "split"
+    copy.mkdir()
+    for path in (data / "laptop/train").iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    shard = copy / "00000.safetensors"
+    shard.write_bytes(shard.read_bytes()[:-4] + b"\0\0\0\0")
+    assert run("info", copy) == 1
+    assert "DAMAGED" in capsys.readouterr().out
+
+
+def test_a_histogram_in_one_line():
+    values = np.concatenate([np.zeros(8), np.ones(4)])
+    line = histogram("name", values, "m")
+    assert line.startswith("  name ")
+    assert "0 █" in line
+    assert "▄ 1 m, mean 0.3333" in line
+    assert "5 deg, mean 5" in histogram("constant", np.full(3, 5.0), "deg")
+
+
+def test_states_in_words():
+    assert describe_state(np.pi / 2, "revolute") == "90°"
+    assert describe_state(0.123, "prismatic") == "12 cm"
+    assert describe_state(float("nan"), "revolute") == "–"
+
+
+def test_preview_draws_a_png(data, tmp_path, capsys):
+    out = tmp_path / "sheet.png"
+    assert run("preview", data, "--out", out, "--count", 6) == 0
+    assert capsys.readouterr().out.startswith("12 samples drawn")
+    content = out.read_bytes()
+    assert content[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = struct.unpack(">II", content[16:24])
+    assert width > 1500
+    assert height > 600
+    assert draw_preview(data, tmp_path / "again.png", 6) == 12
+    assert (tmp_path / "again.png").read_bytes() == content
+    assert draw_preview(data, out, 3, "oven", "test") == 3
+    for arguments in (
+        ("preview", data, "--out", tmp_path / "sheet.jpg"),
+        ("preview", data, "--out", out, "--count", 0),
+        ("preview", data, "--out", out, "--category", "safe"),
+    ):
+        assert run(*arguments) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_check_says_of_each_model_what_came_of_it(tmp_path, capsys):
+    assert run("build", "oven", "--out", tmp_path, "--count", 1) == 0
+    (tmp_path / "oven" / "broken").mkdir()
+    (tmp_path / "oven" / "broken" / "mobility.urdf").write_text("<robot")
+    capsys.readouterr()
+    results = tmp_path / "results.json"
+    assert run("check", tmp_path / "oven", "--json", results, "--workers", 1) == 1
+    text = capsys.readouterr().out
+    assert "1 accepted, 0 repaired, 1 refused" in text
+    assert json.loads(results.read_text())["counts"]["refused"] == 1
+
+
+def test_progress_shows_on_a_terminal_only():
+    for terminal in (True, False):
+        stream = io.StringIO()
+        console = Console(file=stream, force_terminal=terminal, width=100)
+        with progress_bar(console) as show:
+            show("samples", 0, 10)
+            show("samples", 10, 10)
+        assert list(watched(console, "assets", "ab", 2)) == ["a", "b"]
+        assert ("10/10" in stream.getvalue()) is terminal
+    assert RateColumn().max_refresh is None

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""The benchmark's data at a small scale: what is made, recorded, and taken up again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scapo.parallel.pool import Pool
+from scapo.store import open_split
+from sim_assets.__main__ import main
+from sim_assets.generation import benchmark
+from sim_assets.generation.benchmark import (
+    RECORD,
+    SIZES,
+    Piece,
+    make_benchmark,
+    pieces,
+    read_record,
+)
+from sim_assets.generation.generate import Running
+from sim_assets.rendering.backends import resolve_backend
+from sim_assets.rendering.base import RenderError
+
+TINY: benchmark.Sizes = {"train": (2, 4), "val": (1, 3), "test": (1, 2), "test-ood": (1, 2)}
+HERE = Running(workers=0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _renderer() -> None:
+    try:
+        resolve_backend("raycast")
+    except RenderError as error:
+        pytest.skip(str(error))
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def test_all_of_contract_4_is_there():
+    every = pieces()
+    assert len(every) == 10 * 4
+    by_part = {
+        part: {piece.category for piece in every if piece.part == part}
+        for part in ("clean", "sensor")
+    }
+    assert by_part["clean"] == {"laptop", "safe", "eyeglasses", "oven", "washer"}
+    assert by_part["sensor"] == {"basket", "drawer", "laptop", "scissors", "suitcase"}
+    assert SIZES == {"train": (100, 50), "val": (10, 50), "test": (50, 20), "test-ood": (20, 20)}
+    for piece in every:
+        options = piece.options(SIZES, "sapien")
+        instances, each = SIZES[piece.split]
+        assert (options.instances, options.count) == (instances, instances * each)
+        assert (options.seed, options.points, options.backend) == (1, 1024, "sapien")
+        sensor = piece.part == "sensor"
+        wanted = (
+            ("sim-art-sensor", "disparity", "imperfect") if sensor else ("sim-art", "none", "exact")
+        )
+        assert (options.preset, options.noise, options.mask) == wanted
+
+
+@pytest.mark.parametrize(
+    ("only", "names"),
+    [
+        (("sensor/laptop/val",), ["sensor/laptop/val"]),
+        (("laptop/val",), ["clean/laptop/val", "sensor/laptop/val"]),
+        (("oven",), [f"clean/oven/{split}" for split in SIZES]),
+        (("drawer/test", "oven/val"), ["clean/oven/val", "sensor/drawer/test"]),
+    ],
+)
+def test_only(only, names):
+    assert [piece.name for piece in pieces(only)] == names
+
+
+@pytest.mark.parametrize("word", ["chair", "clean/drawer", "sensor/laptop/all", ""])
+def test_only_refuses_what_names_nothing(word):
+    with pytest.raises(ValueError, match=r"only: expected parts \(clean, sensor\), .* found"):
+        pieces((word,))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("benchmark")
+    only = ("laptop/train", "sensor/scissors/val")
+    done = list(make_benchmark(out, only, "raycast", HERE, TINY))
+    assert [d.piece.name for d in done] == [
+        "clean/laptop/train",
+        "sensor/laptop/train",
+        "sensor/scissors/val",
+    ]
+    return out
+
+
+def test_the_record_says_what_is_there(made):
+    record = read_record(made / RECORD)
+    assert record["benchmark"] == "sim-art/1"
+    entry = record["splits"]["sensor/laptop/train"]
+    split = open_split(made / "sensor", "laptop", "train")
+    assert entry["digest"] == split.manifest.digest
+    assert entry["plan_digest"] == split.manifest.plan_digest
+    shards = [split.folder / shard.file for shard in split.manifest.shards]
+    assert entry["bytes"] == sum(path.stat().st_size for path in shards)
+    assert (entry["samples"], entry["objects"]) == (8, 2)
+    assert entry["seconds"] > 0
+    assert record["total"]["samples"] == 8 + 8 + 3
+
+
+def test_the_sensor_part_has_the_camera_noise_and_foreign_points_of_the_contract(made):
+    for name, split, low, high in (("laptop", "train", 0.5, 0.9), ("scissors", "val", 0.5, 0.9)):
+        data = open_split(made / "sensor", name, split)
+        arrays = data.arrays("points", "part", "camera_T_part", "camera")
+        assert (arrays["camera"] == [600, 600, 320, 240, 640, 480]).all()
+        distance = np.linalg.norm(arrays["camera_T_part"][:, 0, :3, 3], axis=-1)
+        assert low <= distance.min() <= distance.max() <= high
+        options = data.manifest.options
+        assert options["noise"] == "disparity"
+        assert options["mask"] == "imperfect"
+        assert options["preset"] == "sim-art-sensor"
+        labels = arrays["part"]
+        assert set(np.unique(labels)) <= {0, 1, 255}
+        assert (labels == 255).any()
+        assert all(((labels == part).sum(1) >= 16).all() for part in (0, 1))
+        steps = 351.3 / arrays["points"][..., 2].astype(float)
+        assert (np.abs(steps - np.rint(steps)) < 1e-3).mean() > 0.95  # all but flying pixels
+    clean = open_split(made / "clean", "laptop", "train")
+    assert "preset" not in clean.manifest.options
+    assert (clean.arrays("camera")["camera"][:, 4:] == 256).all()
+
+
+def test_a_second_run_leaves_all_as_it_is_and_another_folder_gets_the_same(made, tmp_path):
+    before = (made / RECORD).read_bytes()
+    list(make_benchmark(made, ("sensor/scissors/val",), "raycast", HERE, TINY))
+    assert (made / RECORD).read_bytes() == before
+    list(make_benchmark(tmp_path, ("sensor/scissors/val",), "raycast", HERE, TINY))
+    name = "sensor/scissors/val"
+    again, first = (read_record(folder / RECORD)["splits"][name] for folder in (tmp_path, made))
+    assert again["digest"] == first["digest"]
+    for path in (made / name).iterdir():
+        assert (tmp_path / name / path.name).read_bytes() == path.read_bytes()
+
+
+def test_all_splits_are_made_by_the_same_workers(made, tmp_path, monkeypatch):
+    started: list[Pool] = []
+    start = Pool._start
+    monkeypatch.setattr(Pool, "_start", lambda pool: started.append(pool) or start(pool))
+    only = ("laptop/train", "sensor/scissors/val")
+    done = list(make_benchmark(tmp_path, only, "raycast", Running(workers=1), TINY))
+    assert (len(done), len(started)) == (3, 1)
+    for item in done:
+        for path in (made / item.piece.name).iterdir():
+            assert (tmp_path / item.piece.name / path.name).read_bytes() == path.read_bytes()
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(benchmark, "SIZES", TINY)
+    flags = ("--out", tmp_path, "--backend", "raycast", "--workers", 0)
+    assert run("benchmark", "sim-art/1", *flags, "--only", "sensor/scissors/test") == 0
+    text = capsys.readouterr().out
+    assert "1/1 sensor/scissors/test" in text
+    assert "scissors/test: 2 samples of 1 objects" in text
+    assert RECORD in text
+    assert json.loads((tmp_path / RECORD).read_text())["total"]["samples"] == 2
+    assert run("benchmark", "sim-art/1", *flags, "--only", "chair") == 1
+    assert capsys.readouterr().err.startswith("scapo-data: only: expected parts")
+    assert run("benchmark", "sim-art/2", *flags) == 2
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"format": "other"}'])
+def test_a_foreign_record_is_refused(tmp_path, text):
+    (tmp_path / RECORD).write_text(text)
+    with pytest.raises(ValueError, match=r"sim-art-1.json: expected"):
+        read_record(tmp_path / RECORD)
+    assert Piece(part="clean", category="oven", split="test").name == "clean/oven/test"

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""From options to a request: what is refused, and models in place of a generator."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sim_assets.generation import shard as shards
+from sim_assets.generation.generate import Running, generate
+from sim_assets.generation.ledger import GenerateError
+from sim_assets.generation.plan import Piece
+from sim_assets.generation.request import make_request
+from sim_assets.generation.shard import shoot_piece
+from sim_assets.generation.stream import stream
+from sim_assets.options import DataOptions
+
+FULL = DataOptions(protocol="full", points=64, count=30, instances=5)
+"""Needs no renderer."""
+
+
+def test_options_out_of_range_are_refused():
+    for change, message in (
+        ({"count": 0}, "count: expected 1 or more, found 0"),
+        ({"points": 7}, "points: expected 8 or more, found 7"),
+        ({"instances": 31}, "instances: expected at most count, 30, found 31"),
+        ({"states_per_view": 4}, "count: expected a multiple of states_per_view, 4, found 30"),
+        ({"image_size": 5000}, "image_size: expected 4096 or less, found 5000"),
+        ({"up": "z"}, "expected only with a --source folder"),
+        ({"source": "/nowhere/at/all"}, "/nowhere/at/all: expected a folder"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_request("laptop", replace(FULL, **change))
+    with pytest.raises(ValueError, match="category 'chair': expected one of laptop"):
+        next(stream("chair"))
+    with pytest.raises(TypeError, match="colour"):
+        stream("laptop", colour=True)
+
+
+def test_a_folder_of_models_in_place_of_a_generator(tmp_path, shared_dir):
+    source = shared_dir / "assets" / "laptop"
+    options = DataOptions(source=str(source), count=12, points=128, protocol="full")
+    request, assets = make_request("laptop", options)
+    made = generate(request, assets, tmp_path / "split", {}, Running(workers=0))
+    assert made.failed == {}
+    record = made.manifest.instances[0]
+    assert not Path(record.source).is_absolute()
+    assert made.manifest.options["source"] == "urdf"
+    assert str(source) not in (tmp_path / "split/manifest.json").read_text()
+
+
+def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
+    def full(*arguments: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shards, "write", full)
+    request, assets = make_request("laptop", FULL)
+    message = r"split/00000\.safetensors: expected to be written, found: No space left on device"
+    with pytest.raises(GenerateError, match=message):
+        generate(request, assets, tmp_path / "split", {}, Running(workers=0))
+    monkeypatch.setattr("sim_assets.generation.ledger.write_bytes", full)
+    with pytest.raises(GenerateError, match=r"other: expected to be written to, found: No space"):
+        generate(request, assets, tmp_path / "other", {}, Running(workers=0))
+
+
+def test_a_model_that_has_changed_since_the_plan_is_refused():
+    request, (asset, *_) = make_request("laptop", FULL)
+    entry = shards.describe(asset, lambda label, amount: None)
+    other = replace(entry, instance=replace(entry.instance, sha256="f" * 64))
+    piece = Piece(entry=other, index=0, first=0, views=1)
+    with pytest.raises(ValueError, match="they have changed since this data set was begun"):
+        shoot_piece(request, piece, None, lambda label, amount: None)
+    shots = shoot_piece(request, replace(piece, entry=entry), None, lambda label, amount: None)
+    assert len(shots) == 1

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""Checking a folder: every model has its line, and none takes another with it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from sim_assets.inspect.check import Options, check, check_one, exit_code, report, write_report
+from sim_assets.models.validate import AssetError
+from tests.helpers.urdfs import cabinet
+
+
+def test_a_folder(tmp_path: Path):
+    cabinet(tmp_path / "good")
+    cabinet(tmp_path / "mended", ('version="1.0"', 'version="0.0"'))
+    cabinet(tmp_path / "bad", ("body.obj", "lost.obj"))
+    seen: list[str] = []
+    results = check(tmp_path, on_result=lambda result: seen.append(result.path))
+    assert [(r.path.split("/")[0], r.status) for r in results] == [
+        ("bad", "refused"),
+        ("good", "accepted"),
+        ("mended", "repaired"),
+    ]
+    assert sorted(seen) == [r.path for r in results]
+    bad, good, mended = results
+    assert "lost.obj" in bad.reason
+    assert str(tmp_path) not in bad.reason
+    assert (good.joints, good.triangles, good.reason) == (("hinge",), 24, "")
+    assert mended.repairs == ("The XML version '0.0' was read as '1.0'",)
+    assert exit_code(results) == 1
+    assert exit_code([good, mended]) == 0
+    write_report(results, tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data == json.loads(json.dumps(report(results)))
+    assert data["counts"] == {"accepted": 1, "repaired": 1, "refused": 1}
+    assert data["format"] == "scapo-check/1"
+
+
+def test_with_a_category(tmp_path: Path):
+    urdf = cabinet(tmp_path)
+    result = check_one(urdf, tmp_path, Options(category="oven"))
+    assert (result.status, result.joints) == ("accepted", ("hinge",))
+    result = check_one(urdf, tmp_path, Options(category="oven", front="x"))
+    assert result.status == "accepted"
+    assert check_one(urdf, tmp_path, Options(category="drawer")).status == "refused"
+    assert check_one(urdf, tmp_path, Options(category="oven", up="q")).status == "refused"
+
+
+def test_a_part_that_cannot_be_seen(tmp_path: Path):
+    """A door of half a millimetre reads well, but no view gives it its points."""
+    urdf = cabinet(tmp_path)
+    trimesh.creation.box((0.0005, 0.0005, 0.0005)).export(tmp_path / "meshes/door.obj")
+    result = check_one(urdf, tmp_path, Options(category="oven"))
+    assert result.status == "refused"
+    assert "visible pixels" in result.reason
+
+
+def test_nothing_that_moves(tmp_path: Path):
+    """A joint whose base or child cannot be seen is of no use to any category."""
+    limit = ('upper="1.5"', 'upper="0"')
+    result = check_one(cabinet(tmp_path, limit), tmp_path, Options())
+    assert result.status == "refused"
+    assert "travel" in result.reason
+
+
+@pytest.mark.slow
+def test_a_model_that_hangs_or_eats_the_memory(tmp_path: Path):
+    cabinet(tmp_path / "a", ("body.obj", "large.stl"))
+    count = 600_000
+    triangles = np.zeros(count, [("numbers", "<f4", 12), ("attribute", "<u2")])
+    triangles["numbers"] = np.random.default_rng(0).normal(size=(count, 12))
+    head = b"\0" * 80 + struct.pack("<I", count)
+    (tmp_path / "a/meshes/large.stl").write_bytes(head + triangles.tobytes())
+    hung = check(tmp_path, Options(timeout=0.2))
+    assert [r.status for r in hung] == ["refused"]
+    assert "no sign of life" in hung[0].reason
+    starved = check(tmp_path, Options(memory=16 << 20))
+    assert [r.status for r in starved] == ["refused"]
+    assert "Memory" in starved[0].reason or "process" in starved[0].reason
+
+
+def test_no_folder(tmp_path: Path):
+    with pytest.raises(AssetError, match="nothing"):
+        check(tmp_path / "absent")

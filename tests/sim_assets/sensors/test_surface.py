@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""Slopes, incidence angles and depth edges against plane geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_assets.sensors.surface import edges, incidence, surface
+from tests.helpers.depth_plates import angles, camera, plate
+
+CAMERA = camera()
+
+
+@pytest.mark.parametrize("degrees", [0, 10, 45, 70, 78])
+@pytest.mark.parametrize("turn", [0.0, 0.7, 2.5])
+def test_incidence_on_a_plane_is_the_angle_to_each_ray(degrees, turn):
+    depth = plate(CAMERA, 1.3, degrees, turn)
+    found = incidence(surface(depth), CAMERA).reshape(depth.shape)
+    difference = found - angles(CAMERA, degrees, turn)
+    assert np.degrees(np.abs(difference)).max() < 0.5
+
+
+@pytest.mark.parametrize("degrees", [0, 60, 86])
+def test_a_plane_has_no_edges_however_steep(degrees):
+    assert not edges(surface(plate(CAMERA, 1.0, degrees))).any()
+
+
+def test_a_step_is_an_edge_on_both_sides():
+    depth = np.full((20, 30), 1.0, np.float32)
+    depth[:, 15:] = 1.2
+    shown = surface(depth)
+    across = shown.across.reshape(depth.shape)
+    assert np.flatnonzero(edges(shown).reshape(depth.shape)[4]).tolist() == [14, 15]
+    assert across[4, 14] == pytest.approx(1 / 1.2 - 1)
+    assert across[4, 15] == pytest.approx(1 - 1 / 1.2)
+    assert (shown.slope_u == 0).all()
+    turned = surface(depth.T.copy()).across
+    assert np.array_equal(turned.reshape(30, 20).T, across)
+
+
+def test_a_small_step_and_a_crease_are_no_edges():
+    depth = np.full((20, 30), 1.0, np.float32)
+    depth[:, 15:] = 1.005
+    assert not edges(surface(depth)).any()
+    u = np.abs(np.arange(60) - 30) / 585
+    crease = np.broadcast_to(1 + 2 * u, (20, 60)).astype(np.float32)
+    assert not edges(surface(crease)).any()
+
+
+def test_pixels_without_neighbours_have_no_slope_and_nothing_measured_no_edge():
+    depth = np.zeros((9, 9), np.float32)
+    depth[4, 4] = 0.7
+    shown = surface(depth)
+    for name in ("slope_u", "slope_v", "across"):
+        assert (getattr(shown, name) == 0).all()
+    assert np.isfinite(incidence(shown, camera(9))).all()
+    some = np.array([40, 3, 80])
+    assert np.array_equal(surface(depth, some).inverse, shown.inverse[some])
+    depth[2:7, 2:7] = 0.7
+    assert not edges(surface(depth)).any()
