@@ -63,6 +63,8 @@ class ArticulatedObject:
     upper: Float[np.ndarray, " J"]
     """Travel: the state runs from 0 to here, rad or m."""
     origin: Origin
+    trait: str = ""
+    """What sets it apart from the training shapes (`test-ood`); empty where nothing does."""
 
     def pose(self, state: Float[np.ndarray, " J"]) -> Float[np.ndarray, "P 4 4"]:
         """object_T_part of every part: its parent's pose followed by the joint's motion."""

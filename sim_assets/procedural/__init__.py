@@ -2,8 +2,10 @@
 """Procedural articulated objects: one module per category, one function to make an instance.
 
 `generate` is a pure function of its arguments. Training, validation and test shapes come from one
-distribution and never coincide; `test-ood` shapes have a combination of details that training never
-shows and half of their proportions outside the training ranges.
+distribution and never coincide. Of the `test-ood` shapes those with an even index have a
+combination of details that training never shows and half of their proportions, one main one among
+them, outside the training ranges; those with an odd index are drawn as for training and
+rearranged, in turn by each of the recipe's traits. `ArticulatedObject.trait` says which.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from sim_assets.procedural import (
     washer,
 )
 from sim_assets.procedural.assembly import VERSION, Recipe, assemble, digest
-from sim_assets.procedural.parameters import draw
+from sim_assets.procedural.parameters import PROPORTIONS, draw
 
 SPLITS = ("train", "val", "test", "test-ood")
 
@@ -70,7 +72,19 @@ def draw_shape(category: str, split: str, seed: int, index: int) -> Any:  # noqa
     if split not in SPLITS:
         raise ValueError(f"split {split!r}: expected one of {', '.join(SPLITS)}")
     rng = _generator(category, split, int(seed), int(index))
-    return draw(made.shape, rng, held_out=made.held_out, unseen=split == "test-ood")
+    trait = trait_of(category, split, index)
+    drawn = draw(
+        made.shape, rng, held_out=made.held_out, unseen=trait == PROPORTIONS, main=made.main
+    )
+    return replace(drawn, trait=trait)
+
+
+def trait_of(category: str, split: str, index: int) -> str:
+    """What sets an instance apart from the training shapes: in `test-ood` by turns."""
+    if split != "test-ood":
+        return ""
+    others = recipe(category).rearranged
+    return others[index // 2 % len(others)] if index % 2 else PROPORTIONS
 
 
 def generate(category: str, split: str, seed: int, index: int) -> ArticulatedObject:
@@ -94,6 +108,7 @@ def generate(category: str, split: str, seed: int, index: int) -> ArticulatedObj
         recipe(category).build(shape),
         f"procedural/{category}/{split}/{seed}/{index}",
         digest(shape),
+        shape.trait,
     )
 
 

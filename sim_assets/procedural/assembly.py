@@ -16,8 +16,9 @@ from scapo.categories import category as find_category
 from scapo.types import Category
 from sim_assets.objects import ArticulatedObject, Origin, Visual
 from sim_assets.procedural.parameters import HeldOut
+from sim_assets.procedural.shapes import mirrored
 
-VERSION = "scapo-procedural/1"
+VERSION = "scapo-procedural/2"
 """Changes whenever the same arguments give another object."""
 DECIMALS = 7
 """Coordinates are rounded to 1e-7 m, so that files reproduce them exactly."""
@@ -31,9 +32,9 @@ class Design:
     """What a category's builder returns, in any frame with the object frame's axes."""
 
     parts: Parts
-    pivot: Sequence[Sequence[float]]
+    pivot: Sequence[Sequence[float]] | np.ndarray
     """Per joint, m; for prismatic joints replaced by the centre of the moving part's box."""
-    axis: Sequence[Sequence[float]]
+    axis: Sequence[Sequence[float]] | np.ndarray
     upper: Sequence[float]
     """rad or m."""
 
@@ -46,6 +47,11 @@ class Recipe:
     """Dataclass of its free parameters."""
     build: Callable[[Any], Design]
     held_out: HeldOut
+    main: tuple[str, ...] = ()
+    """Parameters that set the object's proportions: one at least leaves its range where the trait
+    is `PROPORTIONS`."""
+    rearranged: tuple[str, ...] = ()
+    """Other traits that `build` knows."""
     symmetric: Mapping[str, object] | None = None
     """Parameters that make the category's swap symmetry exact; None if it has none."""
 
@@ -59,6 +65,19 @@ def shade(color: RGB, factor: float) -> RGB:
     """The colour made darker (factor < 1) or lighter (> 1)."""
     red, green, blue = np.clip(np.asarray(color) * factor, 0.0, 1.0).tolist()
     return (red, green, blue)
+
+
+def mirrored_design(design: Design) -> Design:
+    """The same thing for the other hand: mirrored in the plane y = 0."""
+    flip = np.array([1.0, -1.0, 1.0])
+    return Design(
+        parts=tuple(
+            [Visual(mesh=mirrored(v.mesh, 1), color=v.color) for v in part] for part in design.parts
+        ),
+        pivot=np.asarray(design.pivot) * flip,
+        axis=-np.asarray(design.axis) * flip,  # an axial vector
+        upper=design.upper,
+    )
 
 
 def joint_names(category: Category) -> tuple[str, ...]:
@@ -93,7 +112,7 @@ def digest(shape: Any) -> str:  # noqa: ANN401
 
 
 def assemble(
-    name: str, instance: str, design: Design, source: str, sha256: str
+    name: str, instance: str, design: Design, source: str, sha256: str, trait: str = ""
 ) -> ArticulatedObject:
     """The object with its origin at the centre of the bounding box at rest.
 
@@ -103,6 +122,7 @@ def assemble(
         design: Parts and joints.
         source: Generator and seed, for the manifest.
         sha256: Of the parameters.
+        trait: What sets the object apart from the training shapes.
     """
     category = find_category(name)
     shift = -_bounds([visual for part in design.parts for visual in part]).mean(0)
@@ -128,4 +148,5 @@ def assemble(
             joint_names=names,
             sign=(1.0,) * len(names),
         ),
+        trait=trait,
     )

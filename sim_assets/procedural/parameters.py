@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Free parameters of procedural shapes: declared as dataclass fields, drawn from a generator.
 
-A category's shape is a frozen dataclass whose fields are made by `span` (a proportion), `chance`
+A category's shape is a frozen dataclass whose fields are made by `span` (a length), `ratio` (a
+proportion), `chance`
 (a detail that is there or not), `choice` (one of several styles) and `tint` (a colour). `draw`
 fills it. Outside the training distribution (`test-ood`) proportions leave their training range, up
-to the outer range, and the details take one of the combinations that training never shows.
+to the outer range, and the details take one of the combinations that training never shows; or all
+is drawn as for training and the field `trait` names a rearrangement that the recipe then builds.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from typing import Any, TypeVar
@@ -20,6 +23,11 @@ HeldOut = tuple[Mapping[str, object], ...]
 """Detail combinations kept for `test-ood`: a shape is held out if it agrees with one of them."""
 Color = tuple[float, float, float]
 
+PROPORTIONS = "proportions"
+OTHER_SIDE = "hinge on the other side"
+OTHER_WAY = "opens the other way"
+SET_BACK = "hinge set back"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
@@ -29,16 +37,25 @@ class Span:
     high: float
     least: float
     most: float
+    ratio: bool = False
+    """Uniform in its logarithm: a half is as likely as a double."""
+
+    def _even(self, value: float) -> float:
+        return math.log(value) if self.ratio else value
 
     def inside(self, rng: np.random.Generator) -> float:
-        """Uniform in the training range."""
-        return float(rng.uniform(self.low, self.high))
+        """From the training range."""
+        low, high = self._even(self.low), self._even(self.high)
+        value = float(rng.uniform(low, high))
+        return math.exp(value) if self.ratio else value
 
     def outside(self, rng: np.random.Generator) -> float:
-        """Uniform in the outer range less the training range."""
-        below, above = self.low - self.least, self.most - self.high
+        """From the outer range less the training range and a tenth of the way beyond it."""
+        least, low, high, most = map(self._even, (self.least, self.low, self.high, self.most))
+        below, above = 0.9 * (low - least), 0.9 * (most - high)
         offset = float(rng.uniform(0.0, below + above))
-        return self.least + offset if offset < below else self.high + offset - below
+        value = least + offset if offset < below else most - (below + above - offset)
+        return math.exp(value) if self.ratio else value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +71,13 @@ def span(low: float, high: float, least: float, most: float) -> Any:  # noqa: AN
     if not least <= low < high <= most:
         raise ValueError(f"span: expected least <= low < high <= most, {least, low, high, most}")
     return field(metadata={"draw": Span(low=low, high=high, least=least, most=most)})
+
+
+def ratio(low: float, high: float, least: float, most: float) -> Any:  # noqa: ANN401
+    """As `span`, uniform in the logarithm: of one length over another."""
+    if not 0 < least <= low < high <= most:
+        raise ValueError(f"ratio: expected 0 < least <= low < high <= most, {least, low, high, most}")
+    return field(metadata={"draw": Span(low=low, high=high, least=least, most=most, ratio=True)})
 
 
 def chance(probability: float) -> Any:  # noqa: ANN401
@@ -101,8 +125,23 @@ def agrees(drawn: Mapping[str, Any], combination: Mapping[str, object]) -> bool:
     return all(drawn[name] == value for name, value in combination.items())
 
 
+def _leaving(
+    spans: Mapping[str, Span], rng: np.random.Generator, main: Sequence[str]
+) -> frozenset[str]:
+    """Half of the proportions that can leave their range, one of the main ones among them."""
+    wide = [n for n, s in spans.items() if s.least < s.low or s.high < s.most]
+    first = [str(rng.choice(main))] if main else []
+    order = rng.permutation(np.asarray(wide)).tolist()
+    return frozenset(first + [name for name in order if name not in first][: len(wide) // 2])
+
+
 def draw(
-    shape: type[Shape], rng: np.random.Generator, *, held_out: HeldOut = (), unseen: bool = False
+    shape: type[Shape],
+    rng: np.random.Generator,
+    *,
+    held_out: HeldOut = (),
+    unseen: bool = False,
+    main: Sequence[str] = (),
 ) -> Shape:
     """A random shape of this type.
 
@@ -112,24 +151,19 @@ def draw(
         held_out: Detail combinations that training never shows.
         unseen: Draw for `test-ood`: a held-out combination, and half of the proportions outside
             their training range.
+        main: Proportions one of which leaves its range in any case.
     """
     entries: tuple[Field[Any], ...] = fields(shape)  # pyright: ignore[reportArgumentType]
     options = {
         e.name: e.metadata["draw"] for e in entries if isinstance(e.metadata.get("draw"), Options)
     }
-    spans = [e for e in entries if isinstance(e.metadata.get("draw"), Span)]
+    spans = {
+        e.name: e.metadata["draw"] for e in entries if isinstance(e.metadata.get("draw"), Span)
+    }
     values = _draw_options(options, rng, held_out, unseen)
-    wide = [
-        e.name
-        for e in spans
-        if e.metadata["draw"].least < e.metadata["draw"].low
-        or e.metadata["draw"].high < e.metadata["draw"].most
-    ]
-    chosen = set(rng.permutation(np.asarray(wide))[: (len(wide) + 1) // 2].tolist())
-    for entry in spans:
-        leaves = unseen and entry.name in chosen
-        kind = entry.metadata["draw"]
-        values[entry.name] = kind.outside(rng) if leaves else kind.inside(rng)
+    leaving = _leaving(spans, rng, main) if unseen else frozenset()
+    for name, kind in spans.items():
+        values[name] = kind.outside(rng) if name in leaving else kind.inside(rng)
     for entry in entries:
         if "palette" in entry.metadata:
             values[entry.name] = _draw_color(entry.metadata["palette"], rng)
