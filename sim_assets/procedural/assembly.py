@@ -32,9 +32,9 @@ class Design:
     """What a category's builder returns, in any frame with the object frame's axes."""
 
     parts: Parts
-    pivot: Sequence[Sequence[float]] | np.ndarray
+    pivot: Sequence[Sequence[float] | np.ndarray] | np.ndarray
     """Per joint, m; for prismatic joints replaced by the centre of the moving part's box."""
-    axis: Sequence[Sequence[float]] | np.ndarray
+    axis: Sequence[Sequence[float] | np.ndarray] | np.ndarray
     upper: Sequence[float]
     """rad or m."""
 

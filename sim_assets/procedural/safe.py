@@ -109,8 +109,8 @@ class SafeShape:
     recess: float = span(0.06, 0.14, 0.04, 0.18)
     """Border of the door's recessed panel over its smaller side."""
     travel: float = span(0.8, 1.0, 0.7, 1.0)
-    lock: str = choice("keypad", "dial", "dial and wheel", "keypad and dial", "bar", "bar")
-    side_panel: bool = chance(0.35)
+    lock: str = choice("keypad", "dial", "dial and wheel", "keypad and dial", "bar")
+    side_panel: bool = chance(0.25)
     crowned: bool = chance(0.3)
     below: str = choice("nothing", "nothing", "plinth", "second door")
     lever: bool = chance(0.6)
@@ -118,7 +118,7 @@ class SafeShape:
     feet: bool = chance(0.6)
     shelf: bool = chance(0.5)
     bolts: bool = chance(0.5)
-    front: str = choice("plain", "panelled", "window")
+    front: str = choice("plain", "plain", "panelled", "window")
     plate: bool = chance(0.35)
     """A maker's plate on the door."""
     body_color: tuple[float, float, float] = tint(
