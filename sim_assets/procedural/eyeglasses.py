@@ -7,8 +7,6 @@ Everything is built for the right side and mirrored.
 The hinge axes lean by a few degrees in the frame's plane, as on real glasses, so that one temple
 passes over the other when both are folded: the height between them where they cross is the hinges'
 distance times the tangent of the lean, wherever they cross.
-
-Free parameters of eyeglasses and the measures that follow from them.
 """
 
 from __future__ import annotations
@@ -22,7 +20,15 @@ from jaxtyping import Float
 
 from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
-from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
+from sim_assets.procedural.parameters import (
+    SET_BACK,
+    HeldOut,
+    chance,
+    choice,
+    ratio,
+    span,
+    tint,
+)
 from sim_assets.procedural.shapes import (
     box,
     cylinder,
@@ -37,6 +43,7 @@ from sim_assets.procedural.shapes import (
 )
 
 METAL: RGB = (0.7, 0.68, 0.62)
+SHORTER = "one temple shorter"
 CLEARANCE = 0.0012
 """Between the frame's end pieces and the temples."""
 
@@ -45,47 +52,57 @@ CLEARANCE = 0.0012
 class EyeglassesShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
-    lens_width: float = span(0.045, 0.056, 0.039, 0.063)
-    lens_ratio: float = span(0.68, 0.92, 0.55, 1.0)
+    lens_width: float = span(0.038, 0.06, 0.032, 0.068)
+    lens_ratio: float = ratio(0.5, 1.08, 0.4, 1.3)
     """Height over width."""
-    lens_power: float = span(2.0, 3.4, 1.9, 4.5)
+    lens_power: float = span(1.9, 4.0, 1.7, 5.5)
     """Of the outline: 2 is an ellipse, 4 nearly a rectangle."""
-    lens_taper: float = span(-0.02, 0.14, -0.08, 0.2)
+    lens_taper: float = span(-0.06, 0.2, -0.12, 0.28)
     """How much wider the lens is at its top."""
-    lens_bulge: float = span(0.001, 0.004, 0.0005, 0.006)
-    bridge: float = span(0.014, 0.021, 0.011, 0.026)
-    bridge_rise: float = span(0.1, 0.5, 0.0, 0.7)
+    lens_lift: float = span(-0.04, 0.16, -0.08, 0.24)
+    """Rise of the outline towards its outer side: cat's eyes."""
+    lens_bulge: float = span(0.001, 0.005, 0.0005, 0.007)
+    bridge: float = span(0.012, 0.026, 0.009, 0.032)
+    bridge_rise: float = span(0.0, 0.55, -0.1, 0.75)
     """Height of the bridge over half the lens's."""
-    bridge_arch: float = span(0.001, 0.005, 0.0, 0.008)
-    wrap: float = span(0.002, 0.008, 0.0005, 0.014)
+    bridge_arch: float = span(0.0, 0.006, 0.0, 0.009)
+    wrap: float = span(0.001, 0.012, 0.0005, 0.018)
     """How far the frame's sides lie behind its middle."""
-    rim_width: float = span(0.0018, 0.005, 0.0014, 0.0065)
-    rim_depth: float = span(0.002, 0.0042, 0.0016, 0.0055)
-    overhang: float = span(0.003, 0.007, 0.002, 0.010)
+    rim_width: float = span(0.0016, 0.0065, 0.0013, 0.008)
+    rim_depth: float = span(0.0018, 0.0055, 0.0015, 0.007)
+    overhang: float = span(0.002, 0.010, 0.0015, 0.014)
     """Of the hinges beyond the lenses."""
-    setback: float = span(0.005, 0.011, 0.004, 0.016)
+    setback: float = span(0.005, 0.03, 0.004, 0.036)
     """Of the hinges behind the lenses' outer edges."""
-    hinge_rise: float = span(0.15, 0.6, 0.0, 0.75)
-    temple_length: float = span(0.9, 1.0, 0.84, 1.03)
+    hinge_rise: float = span(0.0, 0.75, -0.15, 0.85)
+    temple_length: float = ratio(0.55, 1.14, 0.46, 1.24)
     """Over the distance of the hinges."""
-    temple_height: float = span(0.004, 0.009, 0.003, 0.013)
+    temple_height: float = span(0.0035, 0.011, 0.003, 0.015)
     """At the hinge."""
-    temple_slim: float = span(0.4, 0.7, 0.35, 0.9)
+    temple_slim: float = span(0.35, 0.9, 0.3, 1.0)
     """Height further back over that at the hinge."""
-    temple_thickness: float = span(0.002, 0.0035, 0.0015, 0.0045)
-    bow: float = span(0.0, 0.004, 0.0, 0.006)
+    temple_thickness: float = span(0.0018, 0.004, 0.0015, 0.005)
+    bow: float = span(0.0, 0.006, 0.0, 0.009)
     """Of the temples outwards."""
-    inward: float = span(0.002, 0.008, 0.0, 0.012)
+    inward: float = span(0.0, 0.01, 0.0, 0.014)
     """Of the temples' ends."""
-    drop: float = span(0.004, 0.009, 0.002, 0.013)
+    drop: float = span(0.001, 0.016, 0.0005, 0.022)
     """Of the ear bends."""
-    bend: float = span(0.62, 0.76, 0.55, 0.82)
+    bend: float = span(0.58, 0.8, 0.5, 0.85)
     """Where the ear bend begins, over the length."""
-    travel: float = span(0.92, 1.0, 0.85, 1.0)
+    curl: float = span(1.2, 2.2, 1.0, 2.6)
+    """Exponent of the ear bend: above 1.6 a hook, below nearly straight."""
+    lean_more: float = span(1.0, 1.35, 1.0, 1.5)
+    """Of the hinge axes over what lets one temple pass over the other."""
+    travel: float = span(0.85, 1.0, 0.75, 1.0)
     rim: str = choice("full", "full", "half", "browline", "none")
     nose_pads: bool = chance(0.6)
     brow_bar: bool = chance(0.25)
     ear_tips: bool = chance(0.6)
+    side_shields: bool = chance(0.15)
+    """Panes at the frame's sides, before the hinges."""
+    saddle: bool = chance(0.3)
+    """A second bar under the bridge, in place of pads."""
     barrel: bool = chance(0.6)
     plates: bool = chance(0.35)
     """A small plate on the outside of either end piece."""
@@ -100,6 +117,7 @@ class EyeglassesShape:
     lens_color: tuple[float, float, float] = tint(
         (0.75, 0.82, 0.86), (0.2, 0.2, 0.22), (0.35, 0.28, 0.2)
     )
+    trait: str = ""
 
     @property
     def lens_height(self) -> float:
@@ -115,7 +133,8 @@ class EyeglassesShape:
     def pivot(self) -> tuple[float, float, float]:
         """A point on the right hinge's axis, at the temple's inner face."""
         y = self.bridge / 2 + self.lens_width + self.overhang
-        return self.wrap + self.setback, y, self.hinge_rise * self.lens_height / 2
+        back = self.setback + (0.35 * self.lens_width if self.trait == SET_BACK else 0.0)
+        return self.wrap + back, y, self.hinge_rise * self.lens_height / 2
 
     @property
     def length(self) -> float:
@@ -126,7 +145,8 @@ class EyeglassesShape:
     def lean(self) -> float:
         """Angle of the hinge axes to z: enough for one folded temple to clear the other."""
         height = self.temple_height * (1 + self.temple_slim) / 2 + self.drop + 0.0032
-        return (1.0 if self.left_over else -1.0) * atan2(height, 2 * self.pivot[1])
+        least = atan2(height, 2 * self.pivot[1])
+        return (1.0 if self.left_over else -1.0) * self.lean_more * least
 
     @property
     def barrel_radius(self) -> float:
@@ -146,7 +166,8 @@ HELD_OUT: HeldOut = (
 )
 SYMMETRIC = {
     "lens_taper": 0.0, "bridge_rise": 0.0, "bridge_arch": 0.0, "hinge_rise": 0.0, "drop": 0.0,
-    "rim": "full", "nose_pads": False, "brow_bar": False,
+    "lens_lift": 0.0, "rim": "full", "nose_pads": False, "brow_bar": False, "saddle": False,
+    "side_shields": False,
 }  # fmt: skip
 
 
@@ -157,6 +178,7 @@ def _outline(s: EyeglassesShape, grow: float = 0.0) -> Float[np.ndarray, "N 2"]:
     """A lens's outline about its middle: outwards, upwards; counter-clockwise."""
     loop = superellipse(s.lens_width + 2 * grow, s.lens_height + 2 * grow, s.lens_power, 40)
     loop[:, 0] *= 1 + s.lens_taper * loop[:, 1] / (s.lens_height / 2)
+    loop[:, 1] += s.lens_lift * loop[:, 0]
     return loop
 
 
@@ -239,6 +261,14 @@ def _nose_pad(s: EyeglassesShape) -> trimesh.Trimesh:
     return merged(pad, sweep(path, superellipse(0.0011, 0.0011, 2.0, 8), (0.0, 0.0, 1.0)))
 
 
+def _shield(s: EyeglassesShape) -> trimesh.Trimesh:
+    """A pane beside the eye, under the end piece."""
+    x, y, z = s.pivot
+    start = _edge(s, s.hinge_rise, 1.0)
+    low = (start[0] + 0.001, y + 0.2 * s.temple_thickness, z - 0.3 * s.lens_height)
+    return box(low, (x - s.start - 0.002, y + 0.2 * s.temple_thickness + 0.0012, z))
+
+
 def _barrels(s: EyeglassesShape, lean: float) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     """The frame's two knuckles and the temple's between them, each with its neck."""
     radius, half = s.barrel_radius, 0.48 * s.temple_height
@@ -270,6 +300,10 @@ def _frame(s: EyeglassesShape) -> list[Visual]:
     bridges = [_bar(s, s.bridge_rise, s.bridge_arch, max(0.0022, 0.8 * s.rim_width))]
     if s.brow_bar:
         bridges.append(_bar(s, 0.82, 0.001, 0.0022))
+    if s.saddle:
+        bridges.append(_bar(s, s.bridge_rise - 0.3, s.bridge_arch, 0.0022))
+    if s.side_shields:
+        rims.append(_shield(s))
     lens = _lens(s)
     visuals = [
         painted(merged(*rims, *(mirrored(piece, 1) for piece in rims), *bridges), s.rim_color),
@@ -285,15 +319,15 @@ def _frame(s: EyeglassesShape) -> list[Visual]:
     return [*visuals, painted(merged(*metal), METAL)] if metal else visuals
 
 
-def _temple(s: EyeglassesShape, lean: float) -> list[Visual]:
+def _temple(s: EyeglassesShape, lean: float, share: float = 1.0) -> list[Visual]:
     """The right temple: tapering, bowed outwards, bent down and inwards behind the ear."""
     x, y, z = s.pivot
     t = np.linspace(0.0, 1.0, 25)
-    along = s.start + t * (s.length - s.start)
+    along = s.start + t * (share * s.length - s.start)
     behind = np.clip((t - s.bend) / (1 - s.bend), 0.0, 1.0)
     offset = s.bow * np.sin(np.pi * t) - s.inward * behind**2
     path = np.column_stack(
-        [x + along, y + s.temple_thickness / 2 + offset, z - s.drop * behind**1.6]
+        [x + along, y + s.temple_thickness / 2 + offset, z - s.drop * behind**s.curl]
     )
     slim = 1 - (1 - s.temple_slim) * np.clip(along / 0.035, 0.0, 1.0)
     profile = rectangle(s.temple_thickness, s.temple_height, 0.3 * s.temple_thickness, segments=2)
@@ -311,16 +345,28 @@ def _temple(s: EyeglassesShape, lean: float) -> list[Visual]:
 
 def build(s: EyeglassesShape) -> Design:
     """Frame, left temple (-y) and right temple (+y), both unfolded; states fold them inwards."""
-    left = [Visual(mesh=mirrored(v.mesh, 1), color=v.color) for v in _temple(s, -s.lean)]
+    shares = (1.0, 1.0)
+    if s.trait == SHORTER:
+        shares = (0.6, 1.0) if s.left_over else (1.0, 0.6)
+    left = [
+        Visual(mesh=mirrored(v.mesh, 1), color=v.color) for v in _temple(s, -s.lean, shares[0])
+    ]
     x, y, z = s.pivot
     # turning +x by a quarter about (0, n_y, n_z) gives (0, n_z, -n_y)
     lean = -sin(s.lean), cos(s.lean)
     return Design(
-        parts=(_frame(s), left, _temple(s, s.lean)),
+        parts=(_frame(s), left, _temple(s, s.lean, shares[1])),
         pivot=[(x, -y, z), (x, y, z)],
         axis=[(0.0, lean[0], lean[1]), (0.0, -lean[0], -lean[1])],
         upper=[s.travel * TRAVEL, s.travel * TRAVEL],
     )
 
 
-RECIPE = Recipe(shape=EyeglassesShape, build=build, held_out=HELD_OUT, symmetric=SYMMETRIC)
+RECIPE = Recipe(
+    shape=EyeglassesShape,
+    build=build,
+    held_out=HELD_OUT,
+    main=("lens_ratio", "temple_length"),
+    rearranged=(SHORTER, SET_BACK),
+    symmetric=SYMMETRIC,
+)
