@@ -16,7 +16,15 @@ from jaxtyping import Float
 
 from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import Design, Recipe, painted, shade
-from sim_assets.procedural.parameters import HeldOut, chance, choice, span, tint
+from sim_assets.procedural.parameters import (
+    SET_BACK,
+    HeldOut,
+    chance,
+    choice,
+    ratio,
+    span,
+    tint,
+)
 from sim_assets.procedural.shapes import (
     ALONG_X,
     FRONT,
@@ -36,6 +44,7 @@ from sim_assets.procedural.shapes import (
 )
 
 TRAVEL = radians(85.0)
+SHORTER = "one handle shorter"
 COUNT = 80
 """Points about the basket: four per column of the weave."""
 
@@ -44,32 +53,35 @@ COUNT = 80
 class BasketShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
-    length: float = span(0.32, 0.46, 0.26, 0.54)
+    length: float = span(0.26, 0.48, 0.22, 0.56)
     """Along y, at the rim."""
-    aspect: float = span(0.62, 0.8, 0.52, 0.92)
+    aspect: float = ratio(0.5, 1.08, 0.4, 1.35)
     """Width (x) over length."""
-    height: float = span(0.15, 0.25, 0.11, 0.31)
-    taper: float = span(0.74, 0.93, 0.66, 0.97)
+    deep: float = ratio(0.26, 0.85, 0.2, 1.1)
+    """Height of the wall over the length."""
+    taper: float = span(0.6, 0.97, 0.5, 1.0)
     """Of the foot over the rim."""
-    curve: float = span(0.6, 1.1, 0.45, 1.5)
+    curve: float = span(0.5, 1.4, 0.4, 1.8)
     """Exponent of the wall's profile."""
-    corner: float = span(0.15, 0.48, 0.08, 0.499)
-    """Radius of the corners over the width."""
+    corner: float = span(0.06, 0.49, 0.03, 0.499)
+    """Radius of the corners over the smaller side."""
+    spread: float = span(0.0, 0.5, 0.0, 0.62)
+    """Of the handles' axes from the middle, over half the length."""
     wall: float = span(0.005, 0.009, 0.004, 0.012)
     weave: float = span(0.0015, 0.003, 0.001, 0.004)
     """How far the strands of a wicker wall stand out."""
-    rim_radius: float = span(0.005, 0.010, 0.004, 0.013)
-    handle_rise: float = span(0.55, 0.95, 0.42, 1.15)
-    """Height of the handles over the basket's."""
-    handle_radius: float = span(0.0045, 0.0075, 0.0035, 0.0095)
-    handle_power: float = span(2.0, 4.0, 2.0, 6.0)
+    rim_radius: float = span(0.004, 0.012, 0.003, 0.016)
+    handle_rise: float = span(0.28, 0.85, 0.2, 1.1)
+    """Height of the handles over the length."""
+    handle_radius: float = span(0.0038, 0.009, 0.003, 0.012)
+    handle_power: float = span(2.0, 5.0, 2.0, 7.0)
     """2: round bow, above: squarer."""
     grip_length: float = span(0.2, 0.4, 0.15, 0.5)
     band_height: float = span(0.5, 0.8, 0.4, 0.85)
     slat_width: float = span(0.35, 0.6, 0.25, 0.7)
     """Over their distance."""
-    foot_height: float = span(0.006, 0.014, 0.004, 0.02)
-    travel: float = span(0.88, 1.0, 0.78, 1.0)
+    foot_height: float = span(0.006, 0.03, 0.004, 0.045)
+    travel: float = span(0.8, 1.0, 0.7, 1.0)
     style: str = choice("wicker", "wicker", "plastic", "slatted")
     grips: bool = chance(0.5)
     twisted: bool = chance(0.4)
@@ -90,6 +102,12 @@ class BasketShape:
     cloth_color: tuple[float, float, float] = tint(
         (0.9, 0.88, 0.82), (0.7, 0.2, 0.2), (0.3, 0.45, 0.6)
     )
+    trait: str = ""
+
+    @property
+    def height(self) -> float:
+        """Of the wall."""
+        return self.length * self.deep
 
     @property
     def width(self) -> float:
@@ -99,7 +117,10 @@ class BasketShape:
     @property
     def offset(self) -> float:
         """The |y| of the handles."""
-        return max(1.35 * self.handle_radius, self.handle_radius + 0.0012) + 0.0012
+        least = max(1.35 * self.handle_radius, self.handle_radius + 0.0012) + 0.0012
+        straight = self.length / 2 - self.corner * min(self.width, self.length) - 0.02
+        share = 0.7 + 0.2 * self.spread if self.trait == SET_BACK else self.spread
+        return max(least, min(share * self.length / 2, straight))
 
     @property
     def reach(self) -> float:
@@ -124,7 +145,7 @@ def _outline(s: BasketShape, z: float, inset: float = 0.0) -> Loop:
     """The wall's horizontal section at height z."""
     scale = s.taper + (1 - s.taper) * max(z / s.height, 0.0) ** s.curve
     size = np.array([s.width, s.length]) * scale - 2 * inset
-    radius = max(s.corner * size[0], 0.002)
+    radius = max(s.corner * size.min(), 0.002)
     return resampled(rectangle(size[0], size[1], radius, segments=12), COUNT)
 
 
@@ -188,14 +209,16 @@ def _rim(s: BasketShape) -> trimesh.Trimesh:
 
 def _ears(s: BasketShape) -> trimesh.Trimesh:
     """Plates on the rim in which the handles turn."""
-    half = s.offset + 1.3 * s.handle_radius + 0.004
+    half = 1.3 * s.handle_radius + 0.004
     top = s.pivot_z + 1.3 * s.handle_radius + 0.002
     x = s.width / 2
-    ear = box((x - 0.0028, -half, s.height - 0.012), (x + 0.0022, half, top))
-    rivets = [placed(cylinder(0.7 * s.handle_radius, x + 0.002, x + 0.0045, 0.0008, 10),
-                     (0.0, side * s.offset, s.pivot_z), ALONG_X) for side in (-1, 1)]  # fmt: skip
-    pieces = merged(ear, *rivets)
-    return merged(pieces, mirrored(pieces, 0))
+    pieces = []
+    for y in (-s.offset, s.offset):
+        pieces.append(box((x - 0.0028, y - half, s.height - 0.012), (x + 0.0022, y + half, top)))
+        rivet = cylinder(0.7 * s.handle_radius, x + 0.002, x + 0.0045, 0.0008, 10)
+        pieces.append(placed(rivet, (0.0, y, s.pivot_z), ALONG_X))
+    both = merged(*pieces)
+    return merged(both, mirrored(both, 0))
 
 
 def _cloth(s: BasketShape) -> trimesh.Trimesh:
@@ -258,11 +281,11 @@ def _body(s: BasketShape) -> list[Visual]:
     ]
 
 
-def _handle(s: BasketShape, y: float) -> list[Visual]:
+def _handle(s: BasketShape, y: float, share: float = 1.0) -> list[Visual]:
     """A bow over the basket's width, upright at this y, with eyes about its axis."""
     angle = np.linspace(0.0, pi, 41)
     exponent = 2.0 / s.handle_power
-    rise = s.handle_rise * s.height
+    rise = share * s.handle_rise * s.length
     x = s.reach * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** exponent
     z = s.pivot_z + rise * np.abs(np.sin(angle)) ** exponent
     path = np.column_stack([x, np.full(41, y), z])
@@ -285,11 +308,18 @@ def build(s: BasketShape) -> Design:
     """Body, left handle (+y, folds towards +y) and right handle (-y, folds towards -y)."""
     y, z = s.offset, s.pivot_z
     return Design(
-        parts=(_body(s), _handle(s, y), _handle(s, -y)),
+        parts=(_body(s), _handle(s, y), _handle(s, -y, 0.55 if s.trait == SHORTER else 1.0)),
         pivot=[(0.0, y, z), (0.0, -y, z)],
         axis=[(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0)],
         upper=[s.travel * TRAVEL, s.travel * TRAVEL],
     )
 
 
-RECIPE = Recipe(shape=BasketShape, build=build, held_out=HELD_OUT, symmetric=SYMMETRIC)
+RECIPE = Recipe(
+    shape=BasketShape,
+    build=build,
+    held_out=HELD_OUT,
+    main=("aspect", "deep", "handle_rise"),
+    rearranged=(SHORTER, SET_BACK),
+    symmetric=SYMMETRIC,
+)

@@ -16,13 +16,22 @@ import trimesh
 
 from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
-from sim_assets.procedural.parameters import HeldOut, chance, span, tint
+from sim_assets.procedural.parameters import (
+    OTHER_SIDE,
+    SET_BACK,
+    HeldOut,
+    chance,
+    ratio,
+    span,
+    tint,
+)
 from sim_assets.procedural.shapes import (
     cylinder,
     ellipsoid,
     lathe,
     loft,
     merged,
+    mirrored,
     placed,
     rectangle,
     superellipse,
@@ -31,6 +40,7 @@ from sim_assets.procedural.shapes import (
 
 STEEL: RGB = (0.72, 0.73, 0.75)
 TRAVEL = radians(60.0)
+LONGER = "one handle longer"
 TURN_X = np.diag([1.0, -1.0, -1.0])
 
 
@@ -38,36 +48,40 @@ TURN_X = np.diag([1.0, -1.0, -1.0])
 class ScissorsShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
-    blade: float = span(0.07, 0.125, 0.05, 0.16)
+    blade: float = ratio(0.045, 0.15, 0.035, 0.19)
     """Length of the blades beyond the pivot."""
-    blade_width: float = span(0.10, 0.16, 0.08, 0.2)
+    blade_width: float = span(0.1, 0.2, 0.08, 0.26)
     """At the pivot, over the blade's length."""
-    overlap: float = span(0.1, 0.3, 0.05, 0.4)
+    overlap: float = span(0.08, 0.34, 0.05, 0.42)
     """Of the closed cutting edges beyond the x axis over the blade's width."""
-    thickness: float = span(0.0016, 0.003, 0.0012, 0.004)
+    thickness: float = span(0.0014, 0.0036, 0.0011, 0.0045)
     gap: float = span(0.0003, 0.0006, 0.0002, 0.0008)
     """Between the halves."""
-    tip_width: float = span(0.06, 0.3, 0.03, 0.45)
+    tip_width: float = span(0.05, 0.42, 0.03, 0.6)
     """Over the width at the pivot."""
-    belly: float = span(0.8, 1.5, 0.6, 2.2)
+    belly: float = span(0.7, 2.0, 0.55, 2.8)
     """Exponent of the spine's taper: below 1 slender, above 1 full."""
-    shank: float = span(0.2, 0.36, 0.14, 0.46)
-    """From the pivot to the ring over the blade's length."""
-    ring_length: float = span(0.042, 0.062, 0.034, 0.076)
-    ring_width: float = span(0.028, 0.038, 0.024, 0.046)
+    shank: float = ratio(0.012, 0.065, 0.01, 0.085)
+    """From the pivot to the ring."""
+    ring_length: float = span(0.034, 0.072, 0.028, 0.088)
+    ring_width: float = span(0.024, 0.042, 0.02, 0.05)
     """Outer width of the ring."""
-    ring_power: float = span(2.0, 2.8, 1.8, 3.4)
-    ring_radius: float = span(0.0035, 0.0055, 0.0028, 0.007)
+    ring_power: float = span(1.9, 3.2, 1.7, 3.8)
+    ring_radius: float = span(0.0025, 0.006, 0.002, 0.0075)
     """Half the thickness of the ring's section."""
-    ring_height: float = span(0.9, 1.5, 0.75, 1.9)
+    ring_height: float = span(0.8, 1.8, 0.7, 2.2)
     """Height over width of the ring's section."""
-    splay: float = span(-0.1, 0.3, -0.2, 0.45)
+    splay: float = span(-0.15, 0.4, -0.25, 0.55)
     """Turn of the rings outwards, rad."""
     screw_radius: float = span(0.28, 0.42, 0.22, 0.48)
     """Over the blade's width."""
-    enlarged: float = span(1.15, 1.45, 1.1, 1.7)
+    stagger: float = span(-0.6, 0.3, -0.75, 0.4)
+    """Of the second ring behind the first, over its length."""
+    narrow: float = span(0.6, 1.0, 0.5, 1.1)
+    """Width of the second ring over the first's, where they are of one size."""
+    enlarged: float = span(1.15, 1.6, 1.1, 1.9)
     """Length of the larger ring over the smaller one's, where they differ."""
-    travel: float = span(0.7, 1.0, 0.55, 1.0)
+    travel: float = span(0.65, 1.0, 0.5, 1.0)
     sleeve: bool = chance(0.65)
     """Plastic grips around the shanks."""
     screw: bool = chance(0.7)
@@ -85,6 +99,17 @@ class ScissorsShape:
     )
     metal_grip: bool = chance(0.25)
     """Rings of the blades' steel."""
+    nut: bool = chance(0.3)
+    """A raised nut on the second half's screw."""
+    trait: str = ""
+
+    @property
+    def reach(self) -> float:
+        """From the pivot to the ring, clear of the blade's root."""
+        least = 0.9 * self.width + 0.004
+        if self.trait == SET_BACK:
+            return max(self.shank, least) + 0.7 * self.blade
+        return max(self.shank, least)
 
     @property
     def width(self) -> float:
@@ -102,24 +127,24 @@ HELD_OUT: HeldOut = (
     {"big_ring": False, "tang": True},
     {"screw": False, "fuller": True},
 )
-SYMMETRIC = {"big_ring": False, "tang": False}
+SYMMETRIC = {"big_ring": False, "tang": False, "nut": False, "stagger": 0.0, "narrow": 1.0}
 
 
-def _ring_outline(s: ScissorsShape, factor: float) -> np.ndarray:
+def _ring_outline(s: ScissorsShape, factor: tuple[float, float]) -> np.ndarray:
     """The centre line of a ring (N, 2), its point nearest to the pivot at the origin."""
-    length = factor * s.ring_length - 2 * s.section
-    width = (0.4 + 0.6 * factor) * s.ring_width - 2 * s.section
+    length = factor[0] * s.ring_length - 2 * s.section
+    width = (0.4 + 0.6 * factor[0]) * factor[1] * s.ring_width - 2 * s.section
     loop = superellipse(length, width, s.ring_power, 36)
     loop[:, 1] *= 1 - 0.25 * loop[:, 0] / length  # wider away from the pivot
     return loop - [length / 2, 0.0]
 
 
-def _ring_path(s: ScissorsShape, factor: float) -> np.ndarray:
+def _ring_path(s: ScissorsShape, factor: tuple[float, float], longer: float) -> np.ndarray:
     """The ring in place at y < 0: its inner side 1 mm clear of the x axis plane."""
     loop = _ring_outline(s, factor)
     cosine, sine = np.cos(s.splay), np.sin(s.splay)
     loop = loop @ np.array([[cosine, sine], [-sine, cosine]])
-    loop[:, 0] -= s.shank * s.blade
+    loop[:, 0] -= max(s.reach + longer, 0.9 * s.width + 0.004)
     loop[:, 1] -= loop[:, 1].max() + s.section + 0.001
     return np.column_stack([loop, np.zeros(len(loop))])
 
@@ -202,7 +227,9 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
 def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
     """The first half, or what becomes the second after half a turn about x."""
     large = second and s.big_ring
-    path = _ring_path(s, s.enlarged if large else 1.0)
+    longer = (0.9 if s.trait == LONGER else s.stagger) * s.ring_length if second else 0.0
+    wide = s.narrow if second and not large else 1.0
+    path = _ring_path(s, (s.enlarged if large else 1.0, wide), longer)
     color = STEEL if s.metal_grip else s.grip_color
     steel = [_blade(s, _root(path))]
     if s.fuller:
@@ -214,7 +241,10 @@ def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
         line = end + step * np.array([-0.016, -0.004, 0.0]) + step**2 * np.array([0, -0.006, 0])
         grips.append(sweep(line, superellipse(0.006, 0.006, 2.0, 10), (0.0, 0.0, 1.0)))
     visuals = [painted(merged(*steel), STEEL), painted(merged(*grips), color)]
-    if s.screw:
+    if s.nut and second:
+        r, z = 0.36 * s.width, s.gap / 2 + s.thickness
+        visuals.append(painted(cylinder(r, z - 3e-4, z + 0.003, 3e-4, 6), shade(STEEL, 0.6)))
+    elif s.screw:
         r, z = s.screw_radius * s.width, s.gap / 2 + s.thickness
         head = lathe([(r, z - 2e-4), (r, z + 0.0007), (0.7 * r, z + 0.0013)], 18)
         visuals.append(painted(head, shade(STEEL, 0.7)))
@@ -232,15 +262,28 @@ def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
 
 def build(s: ScissorsShape) -> Design:
     """Two halves; the second one's blade moves towards -y by a turn about -z."""
+    first = _half(s, second=False)
     second = [
         Visual(mesh=placed(v.mesh, rotation=TURN_X), color=v.color) for v in _half(s, second=True)
     ]
+    if s.trait == OTHER_SIDE:  # for the left hand: mirrored, and the halves change names
+        first, second = (
+            [Visual(mesh=mirrored(v.mesh, 1), color=v.color) for v in half]
+            for half in (second, first)
+        )
     return Design(
-        parts=(_half(s, second=False), second),
+        parts=(first, second),
         pivot=[(0.0, 0.0, 0.0)],
         axis=[(0.0, 0.0, -1.0)],
         upper=[s.travel * TRAVEL],
     )
 
 
-RECIPE = Recipe(shape=ScissorsShape, build=build, held_out=HELD_OUT, symmetric=SYMMETRIC)
+RECIPE = Recipe(
+    shape=ScissorsShape,
+    build=build,
+    held_out=HELD_OUT,
+    main=("blade", "shank"),
+    rearranged=(OTHER_SIDE, LONGER, SET_BACK),
+    symmetric=SYMMETRIC,
+)
