@@ -8,7 +8,7 @@ axis, behind it to its own side of the plane z = 0, so that they touch nowhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 
 import numpy as np
@@ -63,7 +63,7 @@ class ScissorsShape:
     """Exponent of the spine's taper: below 1 slender, above 1 full."""
     shank: float = ratio(0.012, 0.065, 0.01, 0.085)
     """From the pivot to the ring."""
-    ring_length: float = span(0.034, 0.072, 0.028, 0.088)
+    ring_length: float = span(0.034, 0.062, 0.028, 0.074)
     ring_width: float = span(0.024, 0.042, 0.02, 0.05)
     """Outer width of the ring."""
     ring_power: float = span(1.9, 3.2, 1.7, 3.8)
@@ -75,17 +75,21 @@ class ScissorsShape:
     """Turn of the rings outwards, rad."""
     screw_radius: float = span(0.28, 0.42, 0.22, 0.48)
     """Over the blade's width."""
-    stagger: float = span(-0.6, 0.3, -0.75, 0.4)
+    stagger: float = span(-0.7, 0.3, -0.85, 0.4)
     """Of the second ring behind the first, over its length."""
-    narrow: float = span(0.6, 1.0, 0.5, 1.1)
+    narrow: float = span(0.68, 1.5, 0.6, 1.7)
     """Width of the second ring over the first's, where they are of one size."""
-    enlarged: float = span(1.15, 1.6, 1.1, 1.9)
+    second_blade: float = span(0.76, 1.0, 0.68, 1.0)
+    """Length of the second blade over the first's."""
+    thin: float = span(0.6, 1.0, 0.5, 1.15)
+    """Height of the second ring's section over the first's."""
+    enlarged: float = span(1.15, 1.6, 1.1, 1.75)
     """Length of the larger ring over the smaller one's, where they differ."""
     travel: float = span(0.65, 1.0, 0.5, 1.0)
     sleeve: bool = chance(0.65)
     """Plastic grips around the shanks."""
     screw: bool = chance(0.7)
-    big_ring: bool = chance(0.4)
+    big_ring: bool = chance(0.45)
     tang: bool = chance(0.3)
     """A finger rest behind the second ring."""
     pads: bool = chance(0.35)
@@ -112,6 +116,12 @@ class ScissorsShape:
         return max(self.shank, least)
 
     @property
+    def near(self) -> float:
+        """The x behind which the other half's ring may lie: there shanks keep off the x axis."""
+        ahead = min(self.stagger, 0.0) * self.ring_length
+        return 0.006 - max(self.reach + ahead, 0.9 * self.width + 0.004)
+
+    @property
     def width(self) -> float:
         """Of a blade at the pivot."""
         return self.blade_width * self.blade
@@ -127,7 +137,10 @@ HELD_OUT: HeldOut = (
     {"big_ring": False, "tang": True},
     {"screw": False, "fuller": True},
 )
-SYMMETRIC = {"big_ring": False, "tang": False, "nut": False, "stagger": 0.0, "narrow": 1.0}
+SYMMETRIC = {
+    "big_ring": False, "tang": False, "nut": False, "stagger": 0.0, "narrow": 1.0,
+    "second_blade": 1.0, "thin": 1.0,
+}  # fmt: skip
 
 
 def _ring_outline(s: ScissorsShape, factor: tuple[float, float]) -> np.ndarray:
@@ -160,8 +173,10 @@ def _spine(s: ScissorsShape, root: np.ndarray) -> list[tuple[float, float, float
     sections = []
     for t in np.linspace(0.0, 1.0, 8)[:-1]:
         smooth = (1 - t) ** 2 * (1 + 2 * t)
-        middle, half = root[1] * smooth, w * (0.3 + 0.2 * t)
-        sections.append((root[0] * (1 - t), middle - half, middle + half))
+        x, middle, half = root[0] * (1 - t), root[1] * smooth, w * (0.3 + 0.2 * t)
+        if x < s.near:
+            half = min(half, max(-middle, 0.002))
+        sections.append((x, middle - half, middle + half))
     tip = s.tip_width * w
     for t in np.linspace(0.0, 1.0, 12):
         low = -0.5 * w + (0.5 - s.overlap) * w * min(1.0, 5 * t)
@@ -210,6 +225,7 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
             [root[0] * (1 - t), root[1] * smooth, 0.5 * s.gap + 0.5 * s.thickness + 0 * t]
         )
         wide = s.width * (0.66 + 0.3 * t) + 0.0016
+        wide = np.where(line[:, 0] < s.near, np.minimum(wide, np.maximum(-2 * line[:, 1], 0.005)), wide)
         tall = s.thickness + 0.003
         # above the plane z = 0 beside the other half's shank, as thick as the ring at its root
         sizes = [(w, tall) for w in wide]
@@ -227,6 +243,13 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
 def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
     """The first half, or what becomes the second after half a turn about x."""
     large = second and s.big_ring
+    if second:
+        s = replace(
+            s,
+            blade=s.second_blade * s.blade,
+            blade_width=s.blade_width / s.second_blade,
+            ring_height=s.thin * s.ring_height,
+        )
     longer = (0.9 if s.trait == LONGER else s.stagger) * s.ring_length if second else 0.0
     wide = s.narrow if second and not large else 1.0
     path = _ring_path(s, (s.enlarged if large else 1.0, wide), longer)
