@@ -156,7 +156,8 @@ class EyeglassesShape:
     @property
     def start(self) -> float:
         """Distance from the axis at which temple and end piece begin."""
-        return self.barrel_radius + CLEARANCE / 2
+        askew = 0.4 * self.temple_height * abs(sin(self.lean))
+        return self.barrel_radius + CLEARANCE / 2 + askew
 
 
 HELD_OUT: HeldOut = (

@@ -336,8 +336,7 @@ def build(s: LaptopShape) -> Design:
     most = 2.0 * s.half_gap / s.width
     lean = min(max(s.lean, -most), most)
     if s.trait == OTHER_SIDE:
-        side = s.lid_ratio * s.width / 2 + s.half_gap
-        pivot, axis = (s.middle, side, 0.0), (-1.0, 0.0, 0.0)
+        pivot, axis = (s.middle, s.width / 2 + s.half_gap, 0.0), (-1.0, 0.0, 0.0)
     elif lean:
         axis = (sin(lean), cos(lean), 0.0)
     return Design(

@@ -79,9 +79,9 @@ class ScissorsShape:
     """Of the second ring behind the first, over its length."""
     narrow: float = span(0.68, 1.5, 0.6, 1.7)
     """Width of the second ring over the first's, where they are of one size."""
-    second_blade: float = span(0.76, 1.0, 0.68, 1.0)
+    second_blade: float = span(0.74, 1.0, 0.66, 1.0)
     """Length of the second blade over the first's."""
-    thin: float = span(0.6, 1.0, 0.5, 1.15)
+    thin: float = span(0.5, 1.0, 0.42, 1.15)
     """Height of the second ring's section over the first's."""
     enlarged: float = span(1.15, 1.6, 1.1, 1.75)
     """Length of the larger ring over the smaller one's, where they differ."""

@@ -264,8 +264,10 @@ def _handle(s: SuitcaseShape) -> trimesh.Trimesh:
     path = np.array([(s.front + 0.002, -half, z), (s.front - s.handle_height, -0.8 * half, z)])
     rise = bezier(path[0], (path[1][0], -half, z), path[1], 6)
     line = np.concatenate([rise, (rise * [1.0, -1.0, 1.0])[::-1]])
-    profile = superellipse(2 * s.handle_radius, 2.6 * s.handle_radius, 2.5, 12)
-    foot = box((s.front - 0.006, -0.016, z - 0.012), (s.front + 0.001, 0.016, z + 0.012))
+    high = min(0.012, 0.4 * s.heights[0])
+    r = min(s.handle_radius, 0.75 * high)
+    profile = superellipse(2 * r, 2.6 * r, 2.5, 12)
+    foot = box((s.front - 0.006, -0.016, z - high), (s.front + 0.001, 0.016, z + high))
     feet = [placed(foot, (0.0, side * half, 0.0)) for side in (-1, 1)]
     return merged(sweep(line, profile, (0.0, 0.0, 1.0)), *feet)
 
