@@ -11,8 +11,8 @@ from math import radians
 from pathlib import Path
 
 import numpy as np
-from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from PIL import Image, ImageDraw
 
 from scapo.categories import CATEGORIES
@@ -22,7 +22,9 @@ from sim_assets.procedural import generate
 LIGHT = np.array([-0.55, -0.35, 0.76])
 
 
-def shaded(obj: ArticulatedObject, share: float, size: int, view: tuple[float, float]) -> Image.Image:
+def shaded(
+    obj: ArticulatedObject, share: float, size: int, view: tuple[float, float]
+) -> Image.Image:
     """One picture: joints at `share` of their travel, seen from azimuth and elevation (degrees)."""
     poses = obj.pose(share * obj.upper)
     corners, colors = [], []
@@ -39,15 +41,16 @@ def shaded(obj: ArticulatedObject, share: float, size: int, view: tuple[float, f
     right = np.cross([0, 0, 1.0], away)
     right /= np.linalg.norm(right)
     up = np.cross(away, right)
-    reach = 1.05 * max(np.abs((points - middle) @ right).max(), np.abs((points - middle) @ up).max())
+    reach = 1.05 * max(
+        np.abs((points - middle) @ right).max(), np.abs((points - middle) @ up).max()
+    )
     line = (np.arange(size) + 0.5) / size * 2 - 1
     u, v = np.meshgrid(line * reach, -line * reach)
     start = middle + 3 * away + u[..., None] * right + v[..., None] * up
     origins = start.reshape(-1, 3).astype(np.float32)
     rays = np.tile(-away, (len(origins), 1)).astype(np.float32)
-    scene = rtcore_scene.EmbreeScene()
-    mesh = TriangleMesh(scene, triangles.astype(np.float32))
-    del mesh
+    scene = EmbreeScene()
+    TriangleMesh(scene, triangles.astype(np.float32))
     hit = scene.run(origins, rays)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)

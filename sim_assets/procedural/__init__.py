@@ -3,7 +3,7 @@
 
 `generate` is a pure function of its arguments. Training, validation and test shapes come from one
 distribution and never coincide. Of the `test-ood` shapes those with an even index have a
-combination of details that training never shows and half of their proportions, one main one among
+combination of details that training never shows and half of their proportions, the main ones among
 them, outside the training ranges; those with an odd index are drawn as for training and
 rearranged, in turn by each of the recipe's traits. `ArticulatedObject.trait` says which.
 """

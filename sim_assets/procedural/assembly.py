@@ -48,8 +48,8 @@ class Recipe:
     build: Callable[[Any], Design]
     held_out: HeldOut
     main: tuple[str, ...] = ()
-    """Parameters that set the object's proportions: one at least leaves its range where the trait
-    is `PROPORTIONS`."""
+    """Parameters that set the object's proportions: they leave their ranges where the trait is
+    `PROPORTIONS`."""
     rearranged: tuple[str, ...] = ()
     """Other traits that `build` knows."""
     symmetric: Mapping[str, object] | None = None

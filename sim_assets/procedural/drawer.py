@@ -80,9 +80,9 @@ class DrawerShape:
 
     size: float = span(0.32, 0.54, 0.27, 0.62)
     """Cube root of the cabinet's volume."""
-    aspect: float = ratio(0.55, 1.65, 0.44, 2.1)
+    aspect: float = ratio(0.55, 1.65, 0.4, 2.4)
     """Depth over width."""
-    tall: float = ratio(0.34, 4.6, 0.26, 6.0)
+    tall: float = ratio(0.32, 4.8, 0.22, 6.8)
     """Height over width."""
     share: float = ratio(0.08, 0.5, 0.06, 0.65)
     """Height of the moving drawer's bay over the cabinet's."""
@@ -195,7 +195,7 @@ class DrawerShape:
         return Bay(kind="drawer", y=y, z=(self.board + low, self.board + low + high))
 
     def filled(self, kind: str, y: tuple[float, float], z: tuple[float, float]) -> list[Bay]:
-        """Bays of one kind in a clear room, as high as the moving drawer's where they are drawers."""
+        """Bays of one kind in a clear room, drawers about as high as the one that moves."""
         if z[1] - z[0] < 0.5 * LEAST:
             return []
         bay = self.bay.size[1]
@@ -212,7 +212,9 @@ class DrawerShape:
         """All bays but the moving drawer's."""
         bay, top = self.bay, self.height - self.board
         more = self.trait == MORE
-        found = self.filled("drawers" if more else self.below, bay.y, (self.board, bay.z[0] - self.board))
+        found = self.filled(
+            "drawers" if more else self.below, bay.y, (self.board, bay.z[0] - self.board)
+        )
         found += self.filled("drawers" if more else self.above, bay.y, (bay.z[1] + self.board, top))
         if self.columns == 2:
             y = self.column(moving=False)

@@ -53,7 +53,7 @@ class EyeglassesShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
     lens_width: float = span(0.038, 0.06, 0.032, 0.068)
-    lens_ratio: float = ratio(0.5, 1.08, 0.4, 1.3)
+    lens_ratio: float = ratio(0.5, 1.08, 0.34, 1.45)
     """Height over width."""
     lens_power: float = span(1.9, 4.0, 1.7, 5.5)
     """Of the outline: 2 is an ellipse, 4 nearly a rectangle."""
@@ -75,18 +75,18 @@ class EyeglassesShape:
     setback: float = span(0.005, 0.03, 0.004, 0.036)
     """Of the hinges behind the lenses' outer edges."""
     hinge_rise: float = span(0.0, 0.75, -0.15, 0.85)
-    temple_length: float = ratio(0.55, 1.14, 0.46, 1.24)
+    temple_length: float = ratio(0.55, 1.14, 0.38, 1.3)
     """Over the distance of the hinges."""
-    temple_height: float = span(0.0035, 0.011, 0.003, 0.015)
+    temple_height: float = ratio(0.003, 0.012, 0.0026, 0.014)
     """At the hinge."""
     temple_slim: float = span(0.35, 0.9, 0.3, 1.0)
     """Height further back over that at the hinge."""
     temple_thickness: float = span(0.0018, 0.004, 0.0015, 0.005)
-    bow: float = span(0.0, 0.006, 0.0, 0.009)
+    bow: float = ratio(0.0003, 0.006, 0.0002, 0.009)
     """Of the temples outwards."""
-    inward: float = span(0.0, 0.01, 0.0, 0.014)
+    inward: float = ratio(0.0005, 0.011, 0.0003, 0.014)
     """Of the temples' ends."""
-    drop: float = span(0.001, 0.016, 0.0005, 0.022)
+    drop: float = ratio(0.0006, 0.017, 0.0004, 0.021)
     """Of the ear bends."""
     bend: float = span(0.58, 0.8, 0.5, 0.85)
     """Where the ear bend begins, over the length."""
@@ -349,9 +349,7 @@ def build(s: EyeglassesShape) -> Design:
     shares = (1.0, 1.0)
     if s.trait == SHORTER:
         shares = (0.6, 1.0) if s.left_over else (1.0, 0.6)
-    left = [
-        Visual(mesh=mirrored(v.mesh, 1), color=v.color) for v in _temple(s, -s.lean, shares[0])
-    ]
+    left = [Visual(mesh=mirrored(v.mesh, 1), color=v.color) for v in _temple(s, -s.lean, shares[0])]
     x, y, z = s.pivot
     # turning +x by a quarter about (0, n_y, n_z) gives (0, n_z, -n_y)
     lean = -sin(s.lean), cos(s.lean)

@@ -247,7 +247,9 @@ def _ports(s: LaptopShape) -> trimesh.Trimesh:
     pieces = []
     for x in (0.12, 0.2, 0.28):
         place = s.middle + x * s.depth
-        pieces.append(box((place, half - 0.004, z - high / 2), (place + 0.012, half + 5e-4, z + high / 2)))
+        pieces.append(
+            box((place, half - 0.004, z - high / 2), (place + 0.012, half + 5e-4, z + high / 2))
+        )
     return merged(*pieces, *(mirrored(piece, 1) for piece in pieces))
 
 
@@ -339,9 +341,7 @@ def build(s: LaptopShape) -> Design:
         pivot, axis = (s.middle, s.width / 2 + s.half_gap, 0.0), (-1.0, 0.0, 0.0)
     elif lean:
         axis = (sin(lean), cos(lean), 0.0)
-    return Design(
-        parts=(_base(s), _lid(s)), pivot=[pivot], axis=[axis], upper=[s.travel * TRAVEL]
-    )
+    return Design(parts=(_base(s), _lid(s)), pivot=[pivot], axis=[axis], upper=[s.travel * TRAVEL])
 
 
 RECIPE = Recipe(

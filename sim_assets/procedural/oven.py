@@ -426,9 +426,7 @@ def _hinge(s: OvenShape) -> tuple[tuple[float, float, float], tuple[float, float
 def build(s: OvenShape) -> Design:
     """Body and door; the door's upper edge comes forward (-x) by a turn about -y."""
     pivot, axis = _hinge(s)
-    return Design(
-        parts=(_body(s), _door(s)), pivot=[pivot], axis=[axis], upper=[s.travel * TRAVEL]
-    )
+    return Design(parts=(_body(s), _door(s)), pivot=[pivot], axis=[axis], upper=[s.travel * TRAVEL])
 
 
 RECIPE = Recipe(

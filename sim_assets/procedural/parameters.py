@@ -76,7 +76,9 @@ def span(low: float, high: float, least: float, most: float) -> Any:  # noqa: AN
 def ratio(low: float, high: float, least: float, most: float) -> Any:  # noqa: ANN401
     """As `span`, uniform in the logarithm: of one length over another."""
     if not 0 < least <= low < high <= most:
-        raise ValueError(f"ratio: expected 0 < least <= low < high <= most, {least, low, high, most}")
+        raise ValueError(
+            f"ratio: expected 0 < least <= low < high <= most, {least, low, high, most}"
+        )
     return field(metadata={"draw": Span(low=low, high=high, least=least, most=most, ratio=True)})
 
 
@@ -128,9 +130,9 @@ def agrees(drawn: Mapping[str, Any], combination: Mapping[str, object]) -> bool:
 def _leaving(
     spans: Mapping[str, Span], rng: np.random.Generator, main: Sequence[str]
 ) -> frozenset[str]:
-    """Half of the proportions that can leave their range, one of the main ones among them."""
+    """Half of the proportions that can leave their range, the main ones among them."""
     wide = [n for n, s in spans.items() if s.least < s.low or s.high < s.most]
-    first = [str(rng.choice(main))] if main else []
+    first = list(main)
     order = rng.permutation(np.asarray(wide)).tolist()
     return frozenset(first + [name for name in order if name not in first][: len(wide) // 2])
 
@@ -151,7 +153,7 @@ def draw(
         held_out: Detail combinations that training never shows.
         unseen: Draw for `test-ood`: a held-out combination, and half of the proportions outside
             their training range.
-        main: Proportions one of which leaves its range in any case.
+        main: Proportions that leave their range in any case.
     """
     entries: tuple[Field[Any], ...] = fields(shape)  # pyright: ignore[reportArgumentType]
     options = {

@@ -66,21 +66,21 @@ class SafeShape:
 
     size: float = span(0.26, 0.56, 0.22, 0.68)
     """Cube root of the body's volume."""
-    aspect: float = ratio(0.38, 1.35, 0.3, 1.7)
+    aspect: float = ratio(0.36, 1.45, 0.29, 1.8)
     """Depth over width."""
     tall: float = ratio(0.38, 2.2, 0.29, 2.8)
     """Height over width."""
     wall: float = span(0.05, 0.11, 0.035, 0.13)
     """Over the front's smaller side."""
-    door_thickness: float = ratio(0.05, 0.3, 0.035, 0.4)
+    door_thickness: float = ratio(0.022, 0.5, 0.018, 0.6)
     """Over the depth."""
-    door_height_share: float = span(0.88, 0.99, 0.8, 1.0)
+    door_height_share: float = span(0.82, 0.99, 0.74, 1.0)
     """Of the door's height over what crown and foot leave."""
-    panel: float = span(0.14, 0.34, 0.1, 0.42)
+    panel: float = span(0.14, 0.42, 0.1, 0.48)
     """Width of a panel beside the door over the body's."""
-    crown: float = span(0.04, 0.14, 0.02, 0.2)
+    crown: float = span(0.03, 0.18, 0.02, 0.24)
     """Height of a strip above the door over the body's."""
-    foot: float = span(0.22, 0.4, 0.17, 0.46)
+    foot: float = span(0.2, 0.48, 0.15, 0.54)
     """Height of what is under the door over the body's: a second door, or a third of it."""
     hinge_depth: float = span(0.0, 0.8, 0.0, 0.95)
     """Of the axis before the door's inner face, over its thickness."""
@@ -99,7 +99,7 @@ class SafeShape:
     pad_width: float = span(0.18, 0.34, 0.14, 0.42)
     bar_length: float = span(0.35, 0.85, 0.22, 0.95)
     """Of an upright handle over the door's height."""
-    standoff: float = span(0.02, 0.05, 0.015, 0.07)
+    standoff: float = ratio(0.008, 0.05, 0.006, 0.07)
     knuckle_radius: float = span(0.006, 0.014, 0.005, 0.018)
     knuckle_length: float = span(0.1, 0.24, 0.07, 0.3)
     foot_height: float = span(0.008, 0.045, 0.005, 0.07)
@@ -109,8 +109,8 @@ class SafeShape:
     recess: float = span(0.06, 0.14, 0.04, 0.18)
     """Border of the door's recessed panel over its smaller side."""
     travel: float = span(0.8, 1.0, 0.7, 1.0)
-    lock: str = choice("keypad", "dial", "dial and wheel", "keypad and dial", "bar")
-    side_panel: bool = chance(0.25)
+    lock: str = choice("keypad", "dial", "dial and wheel", "keypad and dial", "bar", "slot")
+    side_panel: bool = chance(0.3)
     crowned: bool = chance(0.3)
     below: str = choice("nothing", "nothing", "plinth", "second door")
     lever: bool = chance(0.6)
@@ -293,7 +293,9 @@ def _controls(s: SafeShape, y: float) -> list[Visual]:
     if "keypad" in s.lock:
         key = slab(0.17 * wide, 0.05 * tall, 0.005, 0.002, 0.001)
         spots = [(i, j) for i in (-0.25, 0.0, 0.25) for j in (-0.3, -0.2, -0.1, 0.0, 0.1)]
-        pieces = [_facing(key, s.outer + 0.002, y + i * wide, s.centre[1] + j * tall) for i, j in spots]
+        pieces = [
+            _facing(key, s.outer + 0.002, y + i * wide, s.centre[1] + j * tall) for i, j in spots
+        ]
     else:
         r = min(0.3 * wide, 0.12 * tall)
         knob = lathe([(r, -0.002), (r, 0.012), (0.8 * r, 0.026)], 24)
@@ -382,7 +384,7 @@ def _lever(s: SafeShape) -> trimesh.Trimesh:
 
 def _bar(s: SafeShape, length: float) -> trimesh.Trimesh:
     """An upright handle on two posts, standing on the plane z = 0."""
-    r = s.lever_radius
+    r = min(s.lever_radius, 0.7 * s.standoff)
     bar = box((-r, -length / 2, s.standoff - r), (r, length / 2, s.standoff + r))
     post = cylinder(0.8 * r, -0.002, s.standoff, 0.0, 12)
     return merged(bar, *(placed(post, (0.0, side * 0.42 * length, 0.0)) for side in (-1, 1)))
@@ -392,9 +394,13 @@ def _lock(s: SafeShape) -> list[Visual]:
     """Keypad, dial, wheel and lever, right of the middle, at heights that leave them room."""
     width, height = s.door
     y, z = s.centre
-    if s.lock == "bar" or s.front == "window" or s.side_panel:
+    if s.lock != "slot" and (s.lock == "bar" or s.front == "window" or s.side_panel):
         bar = _bar(s, s.bar_length * height)
         return [painted(_facing(bar, s.outer, y - width / 2 + 0.05 * width + 0.012, z), STEEL)]
+    if s.lock == "slot":
+        plate = slab(0.03, min(0.16, 0.4 * height), 0.003, 0.006, 0.001)
+        place = (s.face + 0.001, y - 0.5 * width + 0.05 * width + 0.02, z)
+        return [painted(_facing(plate, *place), BLACK)]
     right, rise = y - 0.12 * width, 0.2 * height
     visuals = []
     if "keypad" in s.lock:

@@ -48,7 +48,7 @@ TURN_X = np.diag([1.0, -1.0, -1.0])
 class ScissorsShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
-    blade: float = ratio(0.045, 0.15, 0.035, 0.19)
+    blade: float = ratio(0.045, 0.15, 0.028, 0.22)
     """Length of the blades beyond the pivot."""
     blade_width: float = span(0.1, 0.2, 0.08, 0.26)
     """At the pivot, over the blade's length."""
@@ -61,7 +61,7 @@ class ScissorsShape:
     """Over the width at the pivot."""
     belly: float = span(0.7, 2.0, 0.55, 2.8)
     """Exponent of the spine's taper: below 1 slender, above 1 full."""
-    shank: float = ratio(0.012, 0.065, 0.01, 0.085)
+    shank: float = ratio(0.012, 0.065, 0.008, 0.11)
     """From the pivot to the ring."""
     ring_length: float = span(0.034, 0.062, 0.028, 0.074)
     ring_width: float = span(0.024, 0.042, 0.02, 0.05)
@@ -225,7 +225,9 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
             [root[0] * (1 - t), root[1] * smooth, 0.5 * s.gap + 0.5 * s.thickness + 0 * t]
         )
         wide = s.width * (0.66 + 0.3 * t) + 0.0016
-        wide = np.where(line[:, 0] < s.near, np.minimum(wide, np.maximum(-2 * line[:, 1], 0.005)), wide)
+        wide = np.where(
+            line[:, 0] < s.near, np.minimum(wide, np.maximum(-2 * line[:, 1], 0.005)), wide
+        )
         tall = s.thickness + 0.003
         # above the plane z = 0 beside the other half's shank, as thick as the ring at its root
         sizes = [(w, tall) for w in wide]
@@ -240,16 +242,42 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
     return pieces
 
 
+def _second(s: ScissorsShape) -> ScissorsShape:
+    """The measures of the second half: a shorter blade as wide, a thinner ring."""
+    return replace(
+        s,
+        blade=s.second_blade * s.blade,
+        blade_width=s.blade_width / s.second_blade,
+        ring_height=s.thin * s.ring_height,
+    )
+
+
+def _finger_rest(path: np.ndarray) -> trimesh.Trimesh:
+    """A tang behind a ring."""
+    end = path[np.argmin(path[:, 0])]
+    step = np.linspace(0.0, 1.0, 6)[:, None]
+    line = end + step * np.array([-0.016, -0.004, 0.0]) + step**2 * np.array([0, -0.006, 0])
+    return sweep(line, superellipse(0.006, 0.006, 2.0, 10), (0.0, 0.0, 1.0))
+
+
+def _screw(s: ScissorsShape, *, raised: bool) -> Visual:
+    """What holds the halves together: a nut, a screw's head, or a rivet."""
+    z = s.gap / 2 + s.thickness
+    if raised:
+        return painted(cylinder(0.36 * s.width, z - 3e-4, z + 0.003, 3e-4, 6), shade(STEEL, 0.6))
+    if s.screw:
+        r = s.screw_radius * s.width
+        head = lathe([(r, z - 2e-4), (r, z + 0.0007), (0.7 * r, z + 0.0013)], 18)
+        return painted(head, shade(STEEL, 0.7))
+    rivet = cylinder(0.2 * s.width, s.gap / 2 + 2e-4, z + 4e-4, 2e-4, 14)
+    return painted(rivet, shade(STEEL, 0.8))
+
+
 def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
     """The first half, or what becomes the second after half a turn about x."""
     large = second and s.big_ring
     if second:
-        s = replace(
-            s,
-            blade=s.second_blade * s.blade,
-            blade_width=s.blade_width / s.second_blade,
-            ring_height=s.thin * s.ring_height,
-        )
+        s = _second(s)
     longer = (0.9 if s.trait == LONGER else s.stagger) * s.ring_length if second else 0.0
     wide = s.narrow if second and not large else 1.0
     path = _ring_path(s, (s.enlarged if large else 1.0, wide), longer)
@@ -259,21 +287,9 @@ def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
         steel.append(_strip(s))
     grips = _grip(s, path)
     if s.tang and second:
-        end = path[np.argmin(path[:, 0])]
-        step = np.linspace(0.0, 1.0, 6)[:, None]
-        line = end + step * np.array([-0.016, -0.004, 0.0]) + step**2 * np.array([0, -0.006, 0])
-        grips.append(sweep(line, superellipse(0.006, 0.006, 2.0, 10), (0.0, 0.0, 1.0)))
+        grips.append(_finger_rest(path))
     visuals = [painted(merged(*steel), STEEL), painted(merged(*grips), color)]
-    if s.nut and second:
-        r, z = 0.36 * s.width, s.gap / 2 + s.thickness
-        visuals.append(painted(cylinder(r, z - 3e-4, z + 0.003, 3e-4, 6), shade(STEEL, 0.6)))
-    elif s.screw:
-        r, z = s.screw_radius * s.width, s.gap / 2 + s.thickness
-        head = lathe([(r, z - 2e-4), (r, z + 0.0007), (0.7 * r, z + 0.0013)], 18)
-        visuals.append(painted(head, shade(STEEL, 0.7)))
-    else:
-        rivet = cylinder(0.2 * s.width, s.gap / 2 + 2e-4, s.gap / 2 + s.thickness + 4e-4, 2e-4, 14)
-        visuals.append(painted(rivet, shade(STEEL, 0.8)))
+    visuals.append(_screw(s, raised=s.nut and second))
     if s.pads:
         flat = path - path.mean(0)
         scale = 1 - s.section / np.linalg.norm(flat, axis=1, keepdims=True)

@@ -50,9 +50,9 @@ class SuitcaseShape:
 
     length: float = span(0.34, 0.78, 0.28, 0.9)
     """Along y."""
-    aspect: float = ratio(0.5, 1.0, 0.4, 1.25)
+    aspect: float = ratio(0.5, 1.0, 0.34, 1.45)
     """Depth (x) over length."""
-    flat: float = ratio(0.2, 0.6, 0.15, 0.8)
+    flat: float = ratio(0.2, 0.6, 0.13, 0.9)
     """Thickness of the closed case over its length."""
     split: float = span(0.36, 0.8, 0.28, 0.87)
     """Share of the base shell."""
@@ -344,7 +344,8 @@ def _rods(s: SuitcaseShape) -> trimesh.Trimesh:
     half, end = s.rod_width * s.depth / 2, s.length / 2
     rod = box((-0.006, end - 0.003, z - 0.006), (0.006, end + s.rod_height + 0.004, z + 0.006))
     grip = box(
-        (-half - 0.012, end + s.rod_height, z - 0.011), (half + 0.012, end + s.rod_height + 0.022, z + 0.011)
+        (-half - 0.012, end + s.rod_height, z - 0.011),
+        (half + 0.012, end + s.rod_height + 0.022, z + 0.011),
     )
     return merged(
         placed(grip, (s.middle, 0.0, 0.0)),
@@ -360,6 +361,14 @@ def _end_handle(s: SuitcaseShape) -> trimesh.Trimesh:
     corner = (s.middle, end - 0.06, z)
     path = bezier(first, corner, (s.middle + half, end + 0.002, z), 11)
     return sweep(path, rectangle(0.006, 0.022, 0.002, segments=2), (0.0, 0.0, 1.0))
+
+
+def _feet(s: SuitcaseShape) -> trimesh.Trimesh:
+    """Four studs under the base."""
+    foot = cylinder(0.012, -0.007, 0.002, 0.002, 14)
+    z = -s.half_gap - s.heights[0]
+    x, y = 0.5 * s.depth - 0.075, 0.5 * s.length - 0.075
+    return merged(*(placed(foot, (s.middle + i * x, j * y, z)) for i in (-1, 1) for j in (-1, 1)))
 
 
 def _long_base(s: SuitcaseShape) -> list[Visual]:
@@ -379,24 +388,16 @@ def _base(s: SuitcaseShape) -> list[Visual]:
     visuals = [Visual(mesh=placed(v.mesh, place), color=v.color) for v in _half(s, s.heights[0])]
     if s.trait == SET_BACK:
         visuals = _long_base(s)
-    if s.rods and s.trait != OTHER_SIDE:
-        visuals.append(painted(_rods(s), METAL))
-    if s.end_handle:
-        visuals.append(painted(_end_handle(s), BLACK))
-    if s.handle:
-        visuals.append(painted(_handle(s), BLACK))
-    if s.latches:
-        visuals.append(painted(_latches(s), METAL))
-    if s.wheels:
-        visuals.append(painted(_wheels(s), BLACK))
-    if s.straps:
-        visuals.append(painted(_straps(s), shade(s.lining_color, 0.6)))
-    if s.feet:
-        foot = cylinder(0.012, -0.007, 0.002, 0.002, 14)
-        z = -s.half_gap - s.heights[0]
-        x, y = 0.5 * s.depth - 0.075, 0.5 * s.length - 0.075
-        feet = [placed(foot, (s.middle + i * x, j * y, z)) for i in (-1, 1) for j in (-1, 1)]
-        visuals.append(painted(merged(*feet), BLACK))
+    details = (
+        (s.rods and s.trait != OTHER_SIDE, _rods, METAL),
+        (s.end_handle, _end_handle, BLACK),
+        (s.handle, _handle, BLACK),
+        (s.latches, _latches, METAL),
+        (s.wheels, _wheels, BLACK),
+        (s.straps, _straps, shade(s.lining_color, 0.6)),
+        (s.feet, _feet, BLACK),
+    )
+    visuals += [painted(make(s), color) for there, make, color in details if there]
     if s.hinged:
         visuals.append(painted(_hinges(s)[0], METAL))
     return visuals
@@ -427,9 +428,7 @@ def build(s: SuitcaseShape) -> Design:
     pivot, axis = (0.0, 0.0, 0.0), (sin(lean), cos(lean), 0.0)
     if s.trait == OTHER_SIDE:
         pivot, axis = (s.middle, s.length / 2 + 0.004, 0.0), (-1.0, 0.0, 0.0)
-    return Design(
-        parts=(_base(s), _lid(s)), pivot=[pivot], axis=[axis], upper=[s.travel * TRAVEL]
-    )
+    return Design(parts=(_base(s), _lid(s)), pivot=[pivot], axis=[axis], upper=[s.travel * TRAVEL])
 
 
 RECIPE = Recipe(

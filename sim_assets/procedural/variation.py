@@ -54,7 +54,7 @@ def axis_foot(obj: ArticulatedObject, joint: int) -> Float[np.ndarray, " 3"]:
 def tilt(obj: ArticulatedObject, joint: int) -> float:
     """Angle between a joint's axis and the nearest direction of the bounding box, degrees."""
     size = np.sort(np.abs(obj.axis[joint]))
-    return float(np.degrees(np.arctan2(np.hypot(size[0], size[1]), size[2])))
+    return round(float(np.degrees(np.arctan2(np.hypot(size[0], size[1]), size[2]))), 6)
 
 
 def proportions(obj: ArticulatedObject) -> dict[str, float]:

@@ -300,7 +300,9 @@ def _stand(s: WasherShape) -> list[Visual]:
     visuals, low = [], 0.0
     if s.pedestal:
         low = -s.plinth * s.height
-        block = box((0.004, -s.width / 2 + 0.004, low), (s.depth - 0.004, s.width / 2 - 0.004, 0.004))
+        block = box(
+            (0.004, -s.width / 2 + 0.004, low), (s.depth - 0.004, s.width / 2 - 0.004, 0.004)
+        )
         front = slab(s.width - 0.05, -0.8 * low, 0.012, 0.006, 0.003)
         grip = slab(0.4 * s.width, 0.016, 0.018, 0.005, 0.003)
         visuals.append(painted(block, shade(s.body_color, 0.85)))
@@ -332,7 +334,8 @@ def _hung(s: WasherShape, visuals: list[Visual]) -> list[Visual]:
     shift = np.array([0.0, 0.0, s.middle])
     return [
         Visual(
-            mesh=placed(placed(v.mesh, -shift), shift + np.array([0.0, s.aside, 0.0]), turn), color=v.color
+            mesh=placed(placed(v.mesh, -shift), shift + np.array([0.0, s.aside, 0.0]), turn),
+            color=v.color,
         )
         for v in visuals
     ]
