@@ -78,9 +78,9 @@ class Bay:
 class DrawerShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
-    size: float = span(0.32, 0.54, 0.27, 0.62)
+    size: float = span(0.32, 0.54, 0.29, 0.62)
     """Cube root of the cabinet's volume."""
-    aspect: float = ratio(0.55, 1.65, 0.4, 2.4)
+    aspect: float = ratio(0.55, 1.65, 0.45, 2.4)
     """Depth over width."""
     tall: float = ratio(0.32, 4.8, 0.22, 6.8)
     """Height over width."""

@@ -436,7 +436,10 @@ def _door(s: SafeShape) -> list[Visual]:
     """The slab with its inner block, bolts, lock and hinge knuckles."""
     visuals, clear = _slab(s), 0.008 + s.slit
     middle = (s.beside / 2, s.centre[1])
-    size = (s.cavity[0] - 2 * clear - 0.012, s.cavity[1] - 2 * clear - 0.012)
+    size = (
+        max(s.cavity[0] - 2 * clear - 0.012, 0.02),
+        max(s.cavity[1] - 2 * clear - 0.012, 0.02),
+    )
     block = slab(*size, s.plug + GAP + 0.001, 0.006)
     visuals.append(painted(_facing(block, s.plug, *middle), shade(s.inner_color, 0.8)))
     if s.bolts:

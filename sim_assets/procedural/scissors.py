@@ -119,7 +119,8 @@ class ScissorsShape:
     def near(self) -> float:
         """The x behind which the other half's ring may lie: there shanks keep off the x axis."""
         ahead = min(self.stagger, 0.0) * self.ring_length
-        return 0.006 - max(self.reach + ahead, 0.9 * self.width + 0.004)
+        turned = 0.6 * self.enlarged * self.ring_width * abs(np.sin(self.splay))
+        return 0.006 + turned - max(self.reach + ahead, 0.9 * self.width + 0.004)
 
     @property
     def width(self) -> float:

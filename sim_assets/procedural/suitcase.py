@@ -360,7 +360,9 @@ def _end_handle(s: SuitcaseShape) -> trimesh.Trimesh:
     first = (s.middle - half, end + 0.002, z)
     corner = (s.middle, end - 0.06, z)
     path = bezier(first, corner, (s.middle + half, end + 0.002, z), 11)
-    return sweep(path, rectangle(0.006, 0.022, 0.002, segments=2), (0.0, 0.0, 1.0))
+    return sweep(
+        path, rectangle(0.006, min(0.022, 0.5 * s.heights[0]), 0.002, segments=2), (0.0, 0.0, 1.0)
+    )
 
 
 def _feet(s: SuitcaseShape) -> trimesh.Trimesh:
@@ -410,8 +412,8 @@ def _lid(s: SuitcaseShape) -> list[Visual]:
         room = (s.depth - 2 * s.wall + 0.001, s.length - 2 * s.wall + 0.001)
         panel = slab(*room, 0.003, s.corner_radius - s.wall)
         half.append(painted(placed(panel, (0.0, 0.0, -0.012)), shade(s.lining_color, 0.8)))
-    if s.pocketed:
-        room = s.depth - 2 * max(_edge(s, s.heights[1]), s.corner_radius)
+    room = s.depth - 2 * max(_edge(s, s.heights[1]), s.corner_radius)
+    if s.pocketed and room > 0.06:
         thick = min(0.25 * s.heights[1], 0.03) + 0.004
         bag = slab(0.8 * room, s.pocket * (s.length - 0.1), thick, 0.02, 0.008)
         half.append(painted(placed(bag, (0.0, 0.0, 0.004 - thick - s.heights[1])), s.lining_color))

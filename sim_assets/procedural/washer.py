@@ -164,6 +164,14 @@ class WasherShape:
         return self.hole * self.radius
 
     @property
+    def bowl(self) -> float:
+        """How far the glass reaches in: its far edge must pass the opening's when it turns."""
+        far = self.pivot_y + self.hole_radius - 0.014
+        edge = self.pivot_y + self.bowl_taper * 0.86 * self.hole_radius
+        room = max(far**2 - edge**2, 0.0) ** 0.5 - self.ring_thickness - GAP
+        return max(min(self.bowl_depth, room), 0.018)
+
+    @property
     def middle(self) -> float:
         """The z of the door's middle, kept below the control strip."""
         highest = self.height - self.strip - self.radius - 0.02
@@ -359,7 +367,7 @@ def _ring(s: WasherShape) -> trimesh.Trimesh:
 def _bowl(s: WasherShape) -> trimesh.Trimesh:
     """The glass: a bowl open to the front, its bottom inside the opening."""
     inner, small = 0.86 * s.hole_radius + 0.002, s.bowl_taper * 0.86 * s.hole_radius
-    deep = -s.bowl_depth
+    deep = -s.bowl
     mouth = 0.5 * s.ring_thickness
     outside = [(0.6 * small, deep), (small, deep + 0.004), (inner - 0.006, -0.012), (inner, 0.001)]
     inside = [(r - 0.005, z + 0.005) for r, z in outside[::-1]]

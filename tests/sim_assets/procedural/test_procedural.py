@@ -20,25 +20,25 @@ from sim_assets.procedural import (
     recipe,
 )
 from sim_assets.procedural.clearance import penetration, spread_states
-from sim_assets.procedural.parameters import Options, Span, agrees
+from sim_assets.procedural.parameters import PROPORTIONS, Options, Span, agrees
 
-# Bounding box at rest, metres: what shops sell, with the margin of the outer ranges.
+# Bounding box at rest, metres: from what a household has to what a shop could sell.
 SIZES = {
-    "laptop": ((0.14, 0.22, 0.01), (0.38, 0.45, 0.06)),
-    "safe": ((0.24, 0.24, 0.17), (0.72, 0.68, 0.76)),
-    "oven": ((0.44, 0.43, 0.47), (0.92, 0.93, 1.4)),
-    "washer": ((0.44, 0.47, 0.69), (0.93, 0.78, 1.1)),
-    "eyeglasses": ((0.08, 0.09, 0.02), (0.21, 0.19, 0.075)),
-    "basket": ((0.13, 0.26, 0.16), (0.53, 0.58, 0.75)),
-    "drawer": ((0.3, 0.27, 0.1), (0.75, 0.89, 1.6)),
-    "suitcase": ((0.2, 0.37, 0.11), (0.82, 0.93, 0.37)),
-    "scissors": ((0.08, 0.045, 0.005), (0.4, 0.2, 0.04)),
+    "laptop": ((0.09, 0.18, 0.012), (0.56, 0.48, 0.09)),
+    "safe": ((0.16, 0.16, 0.09), (1.5, 1.6, 2.1)),
+    "oven": ((0.29, 0.33, 0.4), (1.6, 1.3, 2.1)),
+    "washer": ((0.32, 0.33, 0.4), (1.3, 1.1, 2.6)),
+    "eyeglasses": ((0.06, 0.09, 0.018), (0.28, 0.21, 0.11)),
+    "basket": ((0.11, 0.2, 0.15), (0.8, 0.62, 1.25)),
+    "drawer": ((0.14, 0.13, 0.1), (1.7, 1.4, 2.8)),
+    "suitcase": ((0.13, 0.28, 0.05), (1.4, 1.15, 0.85)),
+    "scissors": ((0.08, 0.04, 0.005), (0.42, 0.16, 0.035)),
 }
 categories = pytest.mark.parametrize("category", RECIPES)
 
 
 def made(category: str) -> list[ArticulatedObject]:
-    """Two instances of the training range, two beyond it."""
+    """Two instances of the training range, one beyond it, one rearranged."""
     return [generate(category, split, 1, i) for split in ("train", "test-ood") for i in (0, 1)]
 
 
@@ -92,7 +92,7 @@ def test_size_origin_and_joints(category: str):
         assert (obj.extents() <= high).all()
         np.testing.assert_allclose(np.linalg.norm(obj.axis, axis=1), 1.0, atol=1e-9)
         for j, joint in enumerate(known.joints):
-            assert 0.3 * joint.upper < obj.upper[j] <= joint.upper + 1e-6
+            assert 0.06 * joint.upper < obj.upper[j] <= joint.upper + 1e-6
         np.testing.assert_array_equal(obj.origin.object_T_asset, np.eye(4))
 
 
@@ -125,7 +125,7 @@ def test_which_side_is_left():
 
 def test_blades_and_doors():
     scissors = generate("scissors", "train", 0, 0)
-    assert scissors.part_mesh(0).bounds[1, 0] > scissors.pivot[0, 0] + 0.05
+    assert scissors.part_mesh(0).bounds[1, 0] > scissors.pivot[0, 0] + 0.04
     for category in ("safe", "washer"):
         obj = generate(category, "train", 0, 0)
         assert obj.pivot[0, 1] > obj.part_mesh(1).bounds.mean(0)[1]
@@ -138,8 +138,8 @@ def test_drawer_pivot_is_the_centre_of_the_drawer():
 
 @categories
 def test_parts_do_not_reach_into_one_another(category: str):
-    for split in ("train", "test-ood"):
-        obj = generate(category, split, 2, 0)
+    for split, index in (("train", 0), ("test-ood", 0), ("test-ood", 1)):
+        obj = generate(category, split, 2, index)
         steps = 7 if len(obj.upper) == 1 else 3
         assert penetration(obj, spread_states(obj, steps), count=600) == 0.0
 
@@ -147,8 +147,10 @@ def test_parts_do_not_reach_into_one_another(category: str):
 @pytest.mark.slow
 @categories
 def test_parts_do_not_reach_into_one_another_on_many(category: str):
-    for index in range(6):
-        obj = generate(category, "train" if index % 2 else "test-ood", 3, index)
+    chosen = [("train", index) for index in range(6)]
+    chosen += [("test-ood", index) for index in range(12)]  # every trait
+    for split, index in chosen:
+        obj = generate(category, split, 3, index)
         steps = 7 if len(obj.upper) == 1 else 4
         assert penetration(obj, spread_states(obj, steps), count=1000) == 0.0
 
@@ -198,13 +200,27 @@ def test_out_of_distribution_is_out_of_the_training_distribution(category: str):
     held_out = recipe(category).held_out
     for index in range(20):
         known = draw_shape(category, "train", 0, index)
-        unseen = draw_shape(category, "test-ood", 0, index)
+        unseen = draw_shape(category, "test-ood", 0, 2 * index)
+        assert not known.trait
+        assert unseen.trait == PROPORTIONS
         as_dict = {f.name: getattr(unseen, f.name) for f in fields(unseen)}
         assert any(agrees(as_dict, combination) for combination in held_out)
         as_dict = {f.name: getattr(known, f.name) for f in fields(known)}
         assert not any(agrees(as_dict, combination) for combination in held_out)
         assert _outside(known) == 0
         assert _outside(unseen) >= 4
+
+
+@categories
+def test_rearranged_instances_are_drawn_as_for_training(category: str):
+    """What sets them apart is their trait alone; traits come by turns."""
+    held_out, traits = recipe(category).held_out, recipe(category).rearranged
+    shapes = [draw_shape(category, "test-ood", 0, index) for index in range(1, 25, 2)]
+    for shape in shapes:
+        as_dict = {f.name: getattr(shape, f.name) for f in fields(shape)}
+        assert not any(agrees(as_dict, combination) for combination in held_out)
+        assert _outside(shape) == 0
+    assert [shape.trait for shape in shapes] == [traits[k % len(traits)] for k in range(12)]
 
 
 def _outside(shape: object) -> int:
