@@ -48,7 +48,7 @@ TURN_X = np.diag([1.0, -1.0, -1.0])
 class ScissorsShape:
     """Free parameters; lengths in metres, ratios where named so."""
 
-    blade: float = ratio(0.045, 0.15, 0.028, 0.22)
+    blade: float = ratio(0.045, 0.15, 0.045, 0.24)
     """Length of the blades beyond the pivot."""
     blade_width: float = span(0.1, 0.2, 0.08, 0.26)
     """At the pivot, over the blade's length."""
@@ -79,8 +79,6 @@ class ScissorsShape:
     """Of the second ring behind the first, over its length."""
     narrow: float = span(0.68, 1.5, 0.6, 1.7)
     """Width of the second ring over the first's, where they are of one size."""
-    second_blade: float = span(0.74, 1.0, 0.66, 1.0)
-    """Length of the second blade over the first's."""
     thin: float = span(0.5, 1.0, 0.42, 1.15)
     """Height of the second ring's section over the first's."""
     enlarged: float = span(1.15, 1.6, 1.1, 1.75)
@@ -139,8 +137,7 @@ HELD_OUT: HeldOut = (
     {"screw": False, "fuller": True},
 )
 SYMMETRIC = {
-    "big_ring": False, "tang": False, "nut": False, "stagger": 0.0, "narrow": 1.0,
-    "second_blade": 1.0, "thin": 1.0,
+    "big_ring": False, "tang": False, "nut": False, "stagger": 0.0, "narrow": 1.0, "thin": 1.0,
 }  # fmt: skip
 
 
@@ -243,16 +240,6 @@ def _grip(s: ScissorsShape, path: np.ndarray) -> list[trimesh.Trimesh]:
     return pieces
 
 
-def _second(s: ScissorsShape) -> ScissorsShape:
-    """The measures of the second half: a shorter blade as wide, a thinner ring."""
-    return replace(
-        s,
-        blade=s.second_blade * s.blade,
-        blade_width=s.blade_width / s.second_blade,
-        ring_height=s.thin * s.ring_height,
-    )
-
-
 def _finger_rest(path: np.ndarray) -> trimesh.Trimesh:
     """A tang behind a ring."""
     end = path[np.argmin(path[:, 0])]
@@ -278,7 +265,7 @@ def _half(s: ScissorsShape, *, second: bool) -> list[Visual]:
     """The first half, or what becomes the second after half a turn about x."""
     large = second and s.big_ring
     if second:
-        s = _second(s)
+        s = replace(s, ring_height=s.thin * s.ring_height)
     longer = (0.9 if s.trait == LONGER else s.stagger) * s.ring_length if second else 0.0
     wide = s.narrow if second and not large else 1.0
     path = _ring_path(s, (s.enlarged if large else 1.0, wide), longer)

@@ -115,8 +115,8 @@ def test_unseen_proportions_lie_outside_of_what_training_shows(category: str):
     """Measured on the objects; a part that stands out may hide it in a few."""
 
     def measured(obj: ArticulatedObject) -> dict[str, float]:
-        feet = {str(j): float(np.linalg.norm(axis_foot(obj, j))) for j in range(len(obj.axis))}
-        return proportions(obj) | feet
+        feet = np.concatenate([axis_foot(obj, j) for j in range(len(obj.axis))])
+        return proportions(obj) | {f"foot {k}": float(value) for k, value in enumerate(feet)}
 
     rows = [measured(obj) for obj in known(category)]
     low = {name: min(row[name] for row in rows) for name in rows[0]}
