@@ -2,10 +2,10 @@
 """Truth by predicted slot, and the frames that predicted poses refer to.
 
 The order of the parts is chosen by labels alone (`ordering`), the canonical frame of a method
-that saw no poses is fitted on its predictions of the training split (PROTOCOL 1.6). Both are the
-same for every method. Truth is relabelled in a copy, never in place.
+that saw no poses is fitted on its predictions of the training split (docs/protocol.md). Both are
+the same for every method. Truth is relabelled in a copy, never in place.
 
-Labels of points, how they overlap, and the order of parts chosen from them (PROTOCOL 1.2).
+Labels of points, how they overlap, and the order of parts chosen from them (docs/protocol.md).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def part_orders(parts: int) -> np.ndarray:
     """The orders tried by rule, (O, P), identity first: `order[p]` is the true part of slot p.
 
     Two parts: identity and swap. More: the base stays, so three parts have identity and the swap
-    of parts 1 and 2 (PROTOCOL 1.2).
+    of parts 1 and 2 (docs/protocol.md).
     """
     if parts == 2:
         return np.array([[0, 1], [1, 0]])
@@ -225,7 +225,7 @@ def fit_calibration(
     scale: np.ndarray | None = None,
     seed: int = 0,
 ) -> np.ndarray:
-    """Constant offsets T, (P, 4, 4), with pred @ T = true for most samples (PROTOCOL 1.6).
+    """Constant offsets T, (P, 4, 4), with pred @ T = true for most samples (docs/protocol.md).
 
     Args:
         camera_T_part_pred: (B, P, 4, 4).

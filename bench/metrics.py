@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The errors of a prediction, one number per sample and slot, and the precision made of them.
 
-Pure functions of numpy arrays (PROTOCOL 1, CONTRACT 5). A slot is a predicted part or joint.
+Pure functions of numpy arrays (docs/protocol.md). A slot is a predicted part or joint.
 What cannot be computed is NaN, never perfect. Angles are degrees, lengths those of the input.
 
-Average precision of Table 2: shares of samples within limits (PROTOCOL 1.8).
+Average precision of Table 2: shares of samples within limits (docs/protocol.md).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def average_precision(
     joint_pivot: np.ndarray,
     rule: str = "mean",
 ) -> dict[str, float]:
-    """Shares of Table 2 (PROTOCOL 1.8): IoU over 75 and 50 %, errors under k degrees and k cm.
+    """Shares of Table 2 (docs/protocol.md): IoU over 75 and 50 %, errors under k degrees and k cm.
 
     `mean`: per sample, the mean over its parts (joints) of each error is compared. `min`: every
     part (joint) must pass. `per-part`: parts (joints) are counted one by one. Comparisons are
@@ -223,7 +223,7 @@ def agree(
     label_order: LabelOrder | Int[np.ndarray, "B P"],
     iou: IouKind,
 ) -> Agreement:
-    """Order and IoU (PROTOCOL 1.2, 1.3); `label_order` may be the order itself."""
+    """Order and IoU (docs/protocol.md); `label_order` may be the order itself."""
     label = hard_labels(part_pred)
     known = (part_true >= 0) & (part_true < parts)
     true_count = np.stack([(part_true == p).sum(1) for p in range(parts)], 1)
@@ -247,7 +247,7 @@ def pose_errors(
     pred: Num[np.ndarray, "B P 4 4"] | None,
     rotation: RotationKind = "full",
 ) -> tuple[Float[np.ndarray, "B P"], Float[np.ndarray, "B P"]]:
-    """Rotation error in degrees and translation error (PROTOCOL 1.5).
+    """Rotation error in degrees and translation error (docs/protocol.md).
 
     The predicted rotation is brought to the nearest orthogonal matrix first, as published; a
     reflection has no angle and is NaN.
@@ -276,7 +276,7 @@ def joint_errors(
     axis_pred: Num[np.ndarray, "B J 3"] | None,
     kind: PivotKind = "point-line",
 ) -> tuple[Float[np.ndarray, "B J"], Float[np.ndarray, "B J"]]:
-    """Angle between the undirected axes in degrees, and distance of the pivot (PROTOCOL 1.4)."""
+    """Angle between the undirected axes in degrees, and distance of the pivot."""
     nothing = np.full(pivot_true.shape[:2], np.nan)
     true = unit(axis_true)
     pred = None if axis_pred is None else unit(np.asarray(axis_pred, np.float64))
@@ -318,7 +318,7 @@ def state_errors(
     offset: Float[np.ndarray, "*#B J"],
     sign: Float[np.ndarray, "B J"],
 ) -> Float[np.ndarray, "B J"]:
-    """|s phi + offset - theta| (PROTOCOL 1.9), radians (around the circle) or a length.
+    """|s phi + offset - theta| (docs/protocol.md), radians (around the circle) or a length.
 
     Args:
         state_true: theta, ordered like the predicted joints.

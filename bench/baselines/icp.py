@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ICP against a few labelled training shapes: the classical baseline (PROTOCOL 3.6).
+"""ICP against a few labelled training shapes: the classical baseline (docs/protocol.md).
 
 Two ways, because the paper's row mixes what one cannot give. As it stands, the whole cloud is
 registered to whole templates, copies the labels of the nearest template points, and each part

@@ -131,7 +131,7 @@ def robust_chamfer(
 ) -> Float[Tensor, "*B"]:
     """mean(1 - exp(-f D_ab)) + (f / b) mean(1 - exp(-b D_ba)), D squared distances.
 
-    OP-Align's form for partial clouds (PROTOCOL 3.1, L_rigid), f = `forward`, b = `backward`:
+    OP-Align's form for partial clouds (L_rigid), f = `forward`, b = `backward`:
     a point of the shape far from every observed point costs a bounded amount.
     """
     there = 1 - torch.exp(-forward * squared_distances(a, b))
@@ -170,8 +170,8 @@ def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tens
 
 
 MEAN_RADIUS = 0.25
-"""Mean distance of the points from their centroid after `normalise` (PROTOCOL 1.7): a length of 1
-is 4 times the mean radius of that cloud."""
+"""Mean distance of the points from their centroid after `normalise`: a length of 1 is
+4 times the mean radius of that cloud."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -192,7 +192,7 @@ class Template(nn.Module):
 
     The paper says where neither starts. Points: Xavier uniform (OP-Align) until `set_to` puts
     the decoded training medoid in their place. Keypoints: one K per shape is our reading
-    (PROTOCOL 4.5), so the template has its own.
+    (docs/method.md), so the template has its own.
     """
 
     def __init__(self, points: int, parts: int) -> None:

@@ -9,7 +9,7 @@ that blend skinning carries the aligned cloud to the template and back. No label
 Frames: `camera` in metres; `input`, the cloud centred and scaled to mean radius 0.25; `aligned`
 (S_obj); `canonical` (S*); `template` (Y_X).
 
-What OP-Align's released evaluator asks of a network (CONTRACT 3, `record_*`).
+What OP-Align's released evaluator asks of a network (`record_*`, docs/bring-your-own-method.md).
 """
 
 from __future__ import annotations
@@ -285,7 +285,7 @@ class Scapo(AbstractMethod):
 
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
-        """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (PROTOCOL 4.4).
+        """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (docs/method.md).
 
         The part frames are the template's: every part's pose carries the template onto the
         cloud. States are those of the cloud minus the template's. `refine` moves pose and joints

@@ -32,7 +32,7 @@ AblatedTerm = Literal["shape_var", "dir_align", "joint_prox", "joint_boundary"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossConfig:
-    """Weights and readings of the loss; defaults are the paper's (Sec. 4) and PROTOCOL 4.3's."""
+    """Weights and readings of the loss; defaults are the paper's (Sec. 4) and docs/method.md's."""
 
     rec: float = 1.0
     rec_aligned: float = 0.1

@@ -23,7 +23,7 @@ from scapo.paper.skinning import cross_maps, deform, part_maps
 from scapo.types import JointKind
 
 SHARPNESS = (30.0, 120.0)
-"""Of the robust distances, cloud to template and back (PROTOCOL 3.1)."""
+"""Of the robust distances, cloud to template and back (OP-Align's)."""
 
 
 def misfit(

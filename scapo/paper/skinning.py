@@ -92,7 +92,7 @@ def part_maps(incident: Float[Tensor, "B J 2 4 4"]) -> Float[Tensor, "B P 4 4"]:
     """One map per part: the child's side of joint j for part j + 1, the base from all its joints.
 
     With two joints the base has two maps; their mean is used, translations averaged, rotations by
-    the chordal mean (PROTOCOL 4.2). `base_gap` says how far they disagree.
+    the chordal mean (docs/method.md). `base_gap` says how far they disagree.
     """
     base = incident[:, :, 0]  # (B, J, 4, 4)
     if base.shape[1] == 1:

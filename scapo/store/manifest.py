@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`manifest.json`: what a split holds and what made it (CONTRACT 3)."""
+"""`manifest.json`: what a split holds and what made it (docs/data-format.md)."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def _unique(path: Path, what: str, names: Sequence[str]) -> None:
 
 
 def _check_joints(path: Path, manifest: Manifest) -> None:
-    """Part 0 is the base, joint j links it to part j + 1 (CONTRACT 1)."""
+    """Part 0 is the base, joint j links it to part j + 1 (docs/data-format.md)."""
     parts, joints = len(manifest.parts), len(manifest.joints)
     _expect(
         parts == joints + 1,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a shard of samples holds, tensor by tensor, and the check that it does (CONTRACT 3)."""
+"""What a shard of samples holds, tensor by tensor, and the check that it does."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Samples, predictions and checkpoints on disk; what is read is validated here.
 
-Layout: `DIR/<category>/<split>/manifest.json` and shards beside it (CONTRACT 3). One file is
-written and read by `write` and `read` (of `files`), a split through `open_split` and `dataset`.
+Layout: `DIR/<category>/<split>/manifest.json` and shards beside it (docs/data-format.md). One file
+is written and read by `write` and `read` (of `files`), a split through `open_split` and `dataset`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Split:
             raise StoreError(str(error)) from error
 
     def shards(self, names: tuple[str, ...] | None = None) -> Iterator[Arrays]:
-        """Arrays of each shard in order, checked against the manifest and CONTRACT 3.
+        """Arrays of each shard in order, checked against the manifest and the layout.
 
         Raises:
             StoreError: A shard is missing, of another split, size or shape, or holds values that
@@ -70,7 +70,7 @@ class Split:
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
     def shapes(self, count: int) -> dict[str, tuple[int, ...]]:
-        """Expected shape of each sample tensor for `count` samples (CONTRACT 3)."""
+        """Expected shape of each sample tensor for `count` samples (docs/data-format.md)."""
         return sample_shapes(self.manifest, count)
 
     def check_header(self, path: Path, header: Header) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a model with any joints to its category's joints and parts (CONTRACT 1).
+"""From a model with any joints to its category's joints and parts (docs/data-format.md).
 
 The rule: of the joints of the right kind with real travel, those whose link is named as the
 category's moving part (`Category.words`; by the source's semantics, else by link and joint names)
@@ -9,7 +9,7 @@ that the joint moves of area times the length of the centre's path over the trav
 area times its mean displacement. All other joints stay at rest, and their links belong to the
 part they hang on.
 
-Where a model's joints are at rest, which way they open, and how far (CONTRACT 1).
+Where a model's joints are at rest, which way they open, and how far (docs/data-format.md).
 
 Zero has no fixed meaning in the wild: one laptop is open at 0, another closed, a fridge stands half
 open. So the limits are scanned for the state that `Category.rest` describes:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The visual shapes of a link as surfaces in the link's coordinates, checked and two-sided.
 
-URDF primitives as fine closed meshes: SAPIEN's own are off by millimetres (RENDERING 2).
+URDF primitives as fine closed meshes: SAPIEN's own are off by millimetres.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The nine categories are those of CONTRACT 1, and their numbers are possible."""
+"""The nine categories are those of docs/data-format.md, and their numbers are possible."""
 
 from __future__ import annotations
 
