@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
@@ -71,10 +71,14 @@ class Manifest:
     """Of the data; ours is `shards_digest`, other writers may have their own."""
     statistics: dict[str, float]
     """Facts of the run that no reader needs, such as the share of views redrawn."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Object -> reason, of those that were refused or given up; not written where there are none."""
 
     def to_json(self) -> str:
         """Indented, sorted, with a final newline."""
         data = {"format": FORMAT, **asdict(self)}
+        if not self.left_out:
+            del data["left_out"]
         return json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n"
 
 
@@ -99,7 +103,7 @@ def read_manifest(path: Path | str) -> Manifest:
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise ManifestError(f"{path}: expected format {FORMAT!r}, found {found!r}")
-    manifest: Manifest = _record(Manifest, {"statistics": {}, **data}, str(path))
+    manifest: Manifest = _record(Manifest, {"statistics": {}, "left_out": {}, **data}, str(path))
     _check_joints(path, manifest)
     _check_instances(path, manifest)
     _check_shards(path, manifest)
