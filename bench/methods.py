@@ -11,7 +11,7 @@ from typing import Any, cast
 import torch
 
 from bench.baselines.icp import Icp, IcpConfig
-from scapo.categories import category
+from scapo.categories import Category, category
 from scapo.method import AbstractMethod
 from scapo.paper.method import Scapo, ScapoConfig, cpu_config
 from scapo.registered.method import RegisteredScapo
@@ -19,7 +19,6 @@ from scapo.registered.method import cpu_config as cpu_registered
 from scapo.store.checkpoint import config_from, load_arrays, read_checkpoint
 from scapo.store.files import Header
 from scapo.store.schema import StoreError
-from scapo.types import Category
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

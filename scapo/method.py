@@ -15,8 +15,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, nn
 
+from scapo.categories import Category
 from scapo.drawing import PictureData
-from scapo.types import Category, Labels, Observation, Prediction, Supervision
+from scapo.types import Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "refine"]
 

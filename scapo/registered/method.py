@@ -26,6 +26,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from scapo.categories import Category, JointKind
 from scapo.drawing import PictureData
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
@@ -61,7 +62,7 @@ from scapo.registered.template import (
     turn_placement,
 )
 from scapo.registered.views import Views, observe
-from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
+from scapo.types import Labels, Observation, Prediction, Supervision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
