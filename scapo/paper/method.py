@@ -138,6 +138,7 @@ class Scapo(AbstractMethod):
         self.config = config
         self.category = category
         self.supervision = frozenset(config.supervision)
+        self.least_points = config.encoder.neighbours
         self.kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         parts, code = len(category.parts), config.encoder.code
         with torch.random.fork_rng(devices=[]):  # layers draw before `initialise` draws again
