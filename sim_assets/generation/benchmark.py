@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The data of the benchmark `sim-art/1` (CONTRACT 4): OUT/PART/CATEGORY/SPLIT, resumable.
+"""The data of the benchmark `sim-art/1`: OUT/PART/CATEGORY/SPLIT, resumable.
 
 `clean` is exact depth of an object that fills the picture, `sensor` a simulated depth camera at a
 drawn distance with an imperfect mask. What each split cost and holds is recorded in one JSON file.
@@ -126,9 +126,10 @@ def make_benchmark(
         GenerateError: A folder holds something else, or a split cannot be made.
     """
     chosen, running = pieces(only), running or Running()
-    with open_workers(running) as pool:  # they take seconds to start: one set for all pieces
-        for piece in chosen:
-            request, assets = make_request(piece.category, piece.options(sizes or SIZES, backend))
+    asked = [make_request(p.category, p.options(sizes or SIZES, backend)) for p in chosen]
+    requests = [request for request, _ in asked]
+    with open_workers(running, *requests) as pool:  # one set for all pieces
+        for piece, (request, assets) in zip(chosen, asked, strict=True):
             settings = request.settings
             started = time.monotonic()
             made = generate(
