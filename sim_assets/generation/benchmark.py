@@ -16,6 +16,8 @@ from typing import Any, Literal, get_args
 
 from scapo.categories import CATEGORIES
 from scapo.store import write_bytes
+from scapo.store.json_records import from_json, read_json
+from scapo.text import one_line
 from sim_assets.generation.generate import Made, Running, generate, open_workers
 from sim_assets.generation.request import make_request, versions
 from sim_assets.options import DataOptions, SplitName
@@ -145,6 +147,24 @@ def make_benchmark(
             yield done
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Split:
+    """What is read of a split's entry."""
+
+    samples: int
+    bytes: int
+    seconds: float
+    digest: str
+    shards_kept: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Record:
+    """What is read of the record."""
+
+    splits: dict[str, _Split]
+
+
 def _record(path: Path, done: Done) -> None:
     """Add a split to the record; its time stays if nothing was made this time."""
     record = read_record(path)
@@ -172,13 +192,11 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {"format": FORMAT, "benchmark": NAME, "splits": {}, "total": {}}
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, found {error}") from error
+    record = read_json(path)
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{path}: expected format {FORMAT!r}, found {found!r}")
+        raise ValueError(f"{path}: expected format {FORMAT!r}, found {one_line(repr(found), 200)}")
+    from_json(_Record, record, str(path))
     return record
 
 
