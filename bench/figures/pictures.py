@@ -142,7 +142,8 @@ def training_curve(metrics: Path, out: Path) -> None:
             panel.plot(
                 steps, values, linewidth=2 if total else 1.1,
                 color="black" if total else f"C{(number - 1) % 10}",
-                linestyle="-" if number <= 10 else "--", label=plain(name.removeprefix("loss/"), 40),
+                linestyle="-" if number <= 10 else "--",
+                label=plain(name.removeprefix("loss/"), 40),
             )  # fmt: skip
         panel.set_yscale("symlog", linthresh=1e-3)
         panel.set_title(plain(stage, 40), fontsize=10)

@@ -31,7 +31,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "core": ("torch", "numpy", "scipy", "roma", "safetensors", "jaxtyping", "rich", "tyro"),
     "sim": ("sapien", "embreex", "trimesh", "yourdfpy", "lxml", "pillow"),
     "gpu-sim": ("mani-skill",),
-    "bench": ("pandas", "jinja2", "small-gicp", "matplotlib", "tensorboard"),
+    "bench": ("pandas", "small-gicp", "matplotlib", "tensorboard"),
     "view": ("viser",),
     "cluster": ("ray",),
 }
