@@ -8,6 +8,7 @@ answer there: it is counted and its scores are empty.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -233,6 +234,8 @@ _FLOAT = ("F32",)
 _HALF_OR_FLOAT = ("F16", "F32")
 _NUMBER = ("F16", "F32", "F64")
 
+MAX_VALUES = 1 << 18
+"""Of a tensor's row: a sparse file may say that it holds terabytes."""
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R R^T - I and of the last row minus 0 0 0 1."""
 WEIGHT_TOLERANCE = {np.dtype(np.float16): 4e-3, np.dtype(np.float32): 1e-3}
@@ -302,6 +305,8 @@ def _check_tensor(
     if not fits or 0 in found[1:]:
         wanted = tuple("*" if want is None else want for want in shape)
         raise StoreError(f"{where}: expected shape {wanted}, found {found}")
+    if math.prod(found[1:]) > MAX_VALUES:
+        raise StoreError(f"{where}: expected at most {MAX_VALUES} values a sample, found {found}")
 
 
 def check_rows(
