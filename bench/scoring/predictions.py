@@ -20,6 +20,7 @@ from jaxtyping import Bool, Num
 from safetensors import SafetensorError, safe_open
 
 from bench.compat.readings import RECORD
+from scapo.geometry.matrices import rotation_error
 from scapo.store import PREDICTIONS, Split, StoreError, read_header, write
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
@@ -396,11 +397,8 @@ def _check_weights(where: str, array: np.ndarray, known: np.ndarray, first: int)
 
 
 def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
-    rotation = array[known][..., :3, :3].astype(np.float64)
-    product = rotation @ np.swapaxes(rotation, -1, -2)
-    off = np.abs(product - np.eye(3)).max((-1, -2))
     worst = np.zeros(len(array))
-    worst[known] = np.where(np.linalg.det(rotation) > 0, off, 2.0).max(1)
+    worst[known] = rotation_error(array[known][..., :3, :3]).max(1)
     _refuse(
         worst > ROTATION_TOLERANCE,
         where,
