@@ -14,11 +14,11 @@ from sim_assets.generation.plan import Request
 from sim_assets.options import DataOptions, Protocol
 from sim_assets.rendering.backends import resolve_backend
 from sim_assets.rendering.base import Backend
-from sim_assets.sampling.presets import camera, rules
+from sim_assets.sampling.presets import camera, find_preset
 from sim_assets.sampling.samples import Settings
 
 SAMPLES_PER_INSTANCE = 50
-"""By default, as the benchmark's training split (CONTRACT 4)."""
+"""By default, as the benchmark's training split (docs/benchmark.md)."""
 MIN_IMAGE, MAX_IMAGE = 32, 4096
 
 
@@ -70,7 +70,7 @@ def versions(backend: Backend | None, protocol: Protocol) -> dict[str, str]:
 
 
 def _settings(options: DataOptions) -> Settings:
-    preset = rules(options.preset)
+    preset = find_preset(options.preset)
     protocol = options.protocol or preset.protocol
     needed = protocol != "full"
     if not needed and (options.noise, options.mask) != ("none", "exact"):

@@ -21,7 +21,7 @@ from sim_assets.models.textures import barycentric, is_readable, look_up, read_t
 from sim_assets.objects import ArticulatedObject
 from sim_assets.rendering.backends import make_renderer, resolve_backend
 from sim_assets.rendering.base import RenderError
-from sim_assets.sampling.cloud import Surface
+from sim_assets.sampling.cloud import SurfaceSamples
 from sim_assets.sampling.viewpoints import generator
 from tests.helpers.urdfs import cabinet
 
@@ -152,7 +152,7 @@ def test_a_sheet_of_two_materials_shows_each_on_its_side(backend, order, tmp_pat
 def test_a_clouds_colours_are_the_textures(tmp_path):
     shown = thing(tmp_path, TEXTURED, png(np.kron(CORNERS, np.ones((16, 16, 1), np.uint8))))
     poses = np.tile(np.eye(4), (2, 1, 1))
-    cloud = Surface(shown, color=True).sample(poses, 4000, 16, generator("texture"))
+    cloud = SurfaceSamples(shown, color=True).sample(poses, 4000, 16, generator("texture"))
     assert cloud.color is not None
     door = shown.part_mesh(1)
     middle = door.bounds.mean(0)
@@ -163,7 +163,7 @@ def test_a_clouds_colours_are_the_textures(tmp_path):
     expected = CORNERS[(points[:, 2] < 0).astype(int), (points[:, 1] < 0).astype(int)]
     assert clear.sum() > 500
     assert np.array_equal(cloud.color[on][clear], expected[clear])
-    assert Surface(shown).sample(poses, 64, 1, generator("plain")).color is None
+    assert SurfaceSamples(shown).sample(poses, 64, 1, generator("plain")).color is None
 
 
 def test_a_texture_that_is_no_picture_is_left_out_and_said_so(tmp_path):
