@@ -37,6 +37,10 @@ STEPS = 10
 """Of the fit."""
 CLOSE = 0.015
 """As NEAR, at its end."""
+FAR = 1.5
+"""As far as NEAR or CLOSE, where the normals differ too."""
+HOPELESS = 0.6
+"""Share of the points on the surface, halfway through a fit, below which it is given up."""
 FACING = 0.04
 """Diagonals that count as much as a right angle between normals, in the search for the nearest."""
 ROTATION_PRIOR, SHIFT_PRIOR = np.radians(5.0), 0.03
@@ -69,6 +73,7 @@ they pick, then by sign, plus first. Turn k takes the object frame's axes to its
 
 Oriented = Float[np.ndarray, "M 6"]
 """Points and the unit normals of the surface there, outward or towards the camera."""
+States = Float[np.ndarray, " J"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,13 +82,16 @@ class Fit:
 
     object_T_turned: Float[np.ndarray, "4 4"]
     state: Float[np.ndarray, " J"]
+    covered: float = 1.0
+    """Share of the observed points that lie on its surface, about."""
 
 
 class Body:
     """What the search needs of an object: distances to its parts, and its base's box."""
 
-    def __init__(self, thing: ArticulatedObject) -> None:
-        self.thing = thing
+    def __init__(self, thing: ArticulatedObject, samples: int = SAMPLES) -> None:
+        """Draw `samples` points of each part's surface."""
+        self.thing, self.samples = thing, samples
         self.size = float(np.linalg.norm(thing.extents()))
         bounds = thing.part_mesh(0).bounds
         self.centre, self.extents = bounds.mean(0), bounds[1] - bounds[0]
@@ -92,7 +100,7 @@ class Body:
             surface = self._surface(part)
             self.surfaces.append(surface)
             self.trees.append(KDTree(self._keys(surface)))
-            self.grids.append(_Grid(surface[:SAMPLES, :3], self.size))
+            self.grids.append(_Grid(surface[: self.samples, :3], self.size))
         self.states = np.linspace(0, 1, STATES) * thing.upper[:, None]  # (J, K)
         joints = thing.category.joints
         self.motions = np.stack(
@@ -106,7 +114,7 @@ class Body:
         """Samples of a part's surface; of one that is not closed with both of its sides."""
         mesh = self.thing.part_mesh(part)
         rng = generator("ambiguity", self.thing.instance, part)
-        points, face = sample_surface(mesh, SAMPLES, rng)
+        points, face = sample_surface(mesh, self.samples, rng)
         out = np.concatenate([points, np.asarray(mesh.face_normals)[face]], 1)
         closed = all(visual.mesh.is_watertight for visual in self.thing.visuals[part])
         return out if closed else np.concatenate([out, out * [1, 1, 1, -1, -1, -1]])
@@ -135,7 +143,7 @@ class Body:
 
     def cover(
         self, points: Float[np.ndarray, "M 3"], starts: Float[np.ndarray, "T 4 4"]
-    ) -> Float[np.ndarray, "T *K"]:
+    ) -> Float[np.ndarray, "T ..."]:
         """Share of the points within NEAR of the turned object, at each combination of states."""
         joints, states = self.states.shape
         local = _into(starts, points)  # (T, M, 3)
@@ -153,7 +161,7 @@ class Body:
         self,
         seen: Oriented,
         start: Float[np.ndarray, "4 4"],
-        index: tuple[int, ...],
+        states: States,
         *,
         moves: bool,
     ) -> Fit | None:
@@ -162,26 +170,40 @@ class Body:
         Args:
             seen: Observed, object frame of the true placement.
             start: object_T_turned.
-            index: Of the states to start from.
+            states: To start from.
             moves: Fit the placement too, not the states alone.
 
         Returns:
-            None where it leaves the neighbourhood of the start.
+            None where it leaves the neighbourhood of the start, or covers little of the points.
         """
-        pose = start.copy()
-        state = np.array([self.states[j, k] for j, k in enumerate(index)])
-        middle = start[:3, :3] @ self.centre + start[:3, 3]
-        for limit in np.geomspace(NEAR, CLOSE, STEPS):
-            update = self._step(seen, Fit(object_T_turned=pose, state=state), start, limit, moves)
-            moved = np.eye(4)
-            moved[:3, :3] = _rotation(update[:3])
-            moved[:3, 3] = middle - moved[:3, :3] @ middle + update[3:6]
-            pose = moved @ pose
-            state = np.clip(state + update[6:], 0, self.thing.upper)
-        angle, distance = self._moved(start, pose)
+        now = Fit(object_T_turned=start, state=states)
+        for step, limit in enumerate(np.geomspace(NEAR, CLOSE, STEPS)):
+            update, covered = self._step(seen, now, start, limit, moves)
+            if step >= STEPS // 2 and covered < HOPELESS:
+                return None
+            now = self._after(now, update, start, covered)
+        angle, distance = self._moved(start, now.object_T_turned)
         if np.linalg.norm(angle) > MOST_ROTATION or np.linalg.norm(distance) > MOST_SHIFT:
             return None
-        return Fit(object_T_turned=pose, state=state)
+        return now
+
+    def _after(
+        self,
+        now: Fit,
+        update: Float[np.ndarray, " U"],
+        start: Float[np.ndarray, "4 4"],
+        covered: float,
+    ) -> Fit:
+        """The fit after a step."""
+        middle = start[:3, :3] @ self.centre + start[:3, 3]
+        moved = np.eye(4)
+        moved[:3, :3] = _rotation(update[:3])
+        moved[:3, 3] = middle - moved[:3, :3] @ middle + update[3:6]
+        return Fit(
+            object_T_turned=moved @ now.object_T_turned,
+            state=np.clip(now.state + update[6:], 0, self.thing.upper),
+            covered=covered,
+        )
 
     def _moved(
         self, start: Float[np.ndarray, "4 4"], pose: Float[np.ndarray, "4 4"]
@@ -200,13 +222,14 @@ class Body:
         start: Float[np.ndarray, "4 4"],
         limit: float,
         moves: bool,
-    ) -> Float[np.ndarray, " U"]:
-        """Small rotation about the start's box's centre, shift, and changes of the states."""
-        part, foot, normal = self.nearest(seen, now)
-        gap = seen[:, :3] - foot
-        used = np.linalg.norm(gap, axis=1) < limit * self.size
-        rows = self._slopes(part[used], foot[used], normal[used], now, start)
-        distance = (gap[used] * normal[used]).sum(1)
+    ) -> tuple[Float[np.ndarray, " U"], float]:
+        """Small rotation about the start's box's centre, shift, and changes of the states.
+
+        Also the share of the points with a surface within the limit.
+        """
+        used, part, foot, normal = self.nearest(seen, now, FAR * limit * self.size)
+        distance = ((seen[used, :3] - foot) * normal).sum(1)
+        rows = self._slopes(part, foot, normal, now, start)
         joints = len(now.state)
         scale = np.array([ROTATION_PRIOR] * 3 + [SHIFT_PRIOR * self.size] * 3 + [1.0] * joints)
         weight = scale**-2
@@ -220,7 +243,7 @@ class Body:
         free = np.arange(0 if moves else 6, 6 + joints)
         update = np.zeros(6 + joints)
         update[free] = np.linalg.solve(left[np.ix_(free, free)], right[free])
-        return update
+        return update, len(used) / len(seen)
 
     def _slopes(
         self,
@@ -244,22 +267,31 @@ class Body:
         return rows
 
     def nearest(
-        self, seen: Oriented, now: Fit
-    ) -> tuple[Int[np.ndarray, " M"], Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3"]]:
-        """Part, position and normal of the surface sample nearest to each point and normal."""
+        self, seen: Oriented, now: Fit, limit: float
+    ) -> tuple[
+        Int[np.ndarray, " K"],
+        Int[np.ndarray, " K"],
+        Float[np.ndarray, "K 3"],
+        Float[np.ndarray, "K 3"],
+    ]:
+        """Points with a surface sample within the limit; its part, position and normal."""
         poses = now.object_T_turned @ self.thing.pose(now.state)
-        found = []
+        distances, indices = [], []
         for tree, pose in zip(self.trees, poses, strict=True):
             local = [(seen[:, :3] - pose[:3, 3]) @ pose[:3, :3], seen[:, 3:] @ pose[:3, :3]]
-            found.append(tree.query(self._keys(np.concatenate(local, 1))))
-        part = np.argmin([distance for distance, _ in found], 0)
-        foot, normal = np.zeros((len(seen), 3)), np.zeros((len(seen), 3))
-        for p, (_, index) in enumerate(found):
+            keys = self._keys(np.concatenate(local, 1))
+            distance, index = tree.query(keys, distance_upper_bound=limit)
+            distances.append(distance)
+            indices.append(index)
+        used = np.flatnonzero(np.min(distances, 0) < limit)
+        part = np.argmin(distances, 0)[used]
+        foot, normal = np.zeros((len(used), 3)), np.zeros((len(used), 3))
+        for p, index in enumerate(indices):
             mine = part == p
-            chosen, turn = self.surfaces[p][index[mine]], poses[p, :3, :3]
+            chosen, turn = self.surfaces[p][index[used[mine]]], poses[p, :3, :3]
             foot[mine] = chosen[:, :3] @ turn.T + poses[p, :3, 3]
             normal[mine] = chosen[:, 3:] @ turn.T
-        return part, foot, normal
+        return used, part, foot, normal
 
     def posed(
         self, starts: Float[np.ndarray, "T 4 4"], count: int
@@ -280,9 +312,7 @@ class _Grid:
         margin = REACH * size
         self.low = points.min(0) - margin
         shape = np.ceil((np.ptp(points, axis=0) + 2 * margin) / self.cell).astype(int) + 1
-        axes = [
-            low + self.cell * np.arange(n) for low, n in zip(self.low, shape, strict=True)
-        ]
+        axes = [low + self.cell * np.arange(n) for low, n in zip(self.low, shape, strict=True)]
         cells = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
         self.values, _ = KDTree(points).query(cells, distance_upper_bound=margin)
         self.top = shape - 1
