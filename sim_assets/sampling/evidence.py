@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.optimize import linear_sum_assignment
 
@@ -299,7 +299,7 @@ class WholeSurface(AbstractEvidence):
 
 
 def _stand_ins(
-    observed: Int[np.ndarray, " K"], turned: Int[np.ndarray, " K"], parts: int
+    observed: Integer[np.ndarray, " K"], turned: Integer[np.ndarray, " K"], parts: int
 ) -> Int[np.ndarray, " P"]:
     """The true part in whose place each part of the turned object is, one to one."""
     pairs = turned.astype(np.intp) * parts + observed

@@ -151,7 +151,8 @@ def test_shards_are_memory_mapped(folder: Path, samples: SampleDataset) -> None:
 
 
 def test_names_choose_the_tensors(folder: Path) -> None:
-    assert set(TENSORS) == set(LAYOUT) - {"color"}
+    optional = {"color", "alike", "alike_base", "alike_state", "alike_part"}
+    assert set(TENSORS) == set(LAYOUT) - optional
     found = store.dataset(folder, names=("points", "part"))[0]
     assert set(found) == {"points", "part", "index"}
     with pytest.raises(StoreError, match=r"00000.safetensors: expected tensor 'color', found none"):
