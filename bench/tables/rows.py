@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Rows of the tables: the paper's as printed, ours from the scores, and their order.
+"""Rows of the tables, the paper's as printed and ours from the scores, and their order.
 
-What is printed under every table: how to read it, and what each row cost.
+Below them the notes of every table: how to read it, and what each row cost.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from bench.tables.model import Cell, Marks, Row
 from bench.tables.paper import MEAN, Cells, Mismatch
 from bench.tables.results import Kind, Results, Sampled, Series, averaged, kind_of
 from bench.tables.spec import METHODS, ORDER, PAPER_METHODS, REFERENCE, TABLE_1
+from scapo.text import one_line
 
 DATASET_ORDER = "label-order=dataset"
 
@@ -94,8 +95,8 @@ def marks_of(results: Results, series: Series) -> Marks | None:
     for run in results.all_runs():
         same = (run.run.method, run.run.variant.partition("[")[0]) == (
             series.method, series.variant)  # fmt: skip
-        if same and "supervision" in run.report and series.method not in REFERENCE:
-            labels = run.report["supervision"]
+        if same and series.method not in REFERENCE:
+            labels = run.report.supervision
             return ("pose" in labels, "segmentation" in labels, "joint" in labels)
     return None
 
@@ -136,18 +137,14 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
             or "[" in run.run.variant
         ):
             continue
-        budget = run.report.get("budget") or {}
-        cost = (
-            ", ".join(
-                f"{key.replace('_', ' ')} {_short(value)}" for key, value in sorted(budget.items())
-            )
-            or "not stated"
-        )
+        budget = run.report.budget
+        named = {_short(key.replace("_", " ")): value for key, value in sorted(budget.items())}
+        cost = ", ".join(f"{key} {_short(value)}" for key, value in named.items())
         name = METHODS.get(run.run.method, run.run.method)
         variant = f" ({run.run.variant})" if run.run.variant else ""
         text = (
             f"{name}{variant}, {run.run.category} on {run.run.data}, "
-            f"{len(run.samples)} samples; budget: {cost}"
+            f"{len(run.samples)} samples; budget: {cost or 'not stated'}"
         )
         lines.setdefault(text, set()).add(run.run.seed)
     return tuple(
@@ -156,4 +153,4 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
 
 
 def _short(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else one_line(value, 200)

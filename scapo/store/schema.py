@@ -32,13 +32,17 @@ LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "visible": ("float32", ("P",)),
     "camera": ("float32", (6,)),
     "instance": ("int32", ()),
+    "sensor": ("float32", (3,)),
     "alike": ("uint8", (24,)),
     "alike_base": ("float32", (24, 4, 4)),
     "alike_state": ("float32", (24, "J")),
     "alike_part": ("uint8", (24, "P")),
 }
-"""dtype and shape of one sample's tensors; on disk the samples of a shard are stacked. `color` and
-the four of ambiguity (docs/ambiguity.md) are optional."""
+"""dtype and shape of one sample's tensors; on disk the samples of a shard are stacked. `color` is
+optional, and so are `sensor`, the camera's centre in metres where clouds are not in its frame, and
+the four of ambiguity (docs/ambiguity.md)."""
+ALIKE = ("alike", "alike_base", "alike_state", "alike_part")
+"""The tensors of ambiguity, all there or none."""
 
 
 @runtime_checkable
