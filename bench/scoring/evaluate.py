@@ -7,7 +7,7 @@ What `evaluate` and `explain` share: the request, its data, the frames of the me
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from bench.requests import Request, Settings
+from bench.scoring.ambiguity import score_best
 from bench.scoring.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.scoring.compat_files import Canon, check_record, fit_canon, score_compat
 from bench.scoring.predictions import Header, Predictions, read_prediction_header
@@ -134,6 +135,7 @@ def evaluate(request: Request) -> dict[str, Any]:
         run = run_of(request, header, split)
         with writing(request.out) as file:
             for truth in blocks(split):
+                _check_alike(request, split, truth)
                 rows = predictions.rows(truth.first, len(truth))
                 errors = _errors(request.settings, fitted, truth, rows)
                 file.add(run, truth.first, errors)
@@ -141,6 +143,14 @@ def evaluate(request: Request) -> dict[str, Any]:
             predictions.finish()
             file.report = _report(request, header, split, fitted, scored, predictions)
     return file.report
+
+
+def _check_alike(request: Request, split: Split, truth: Truth) -> None:
+    if request.settings.ambiguity == "on" and truth.alike is None:
+        raise StoreError(
+            f"{split.folder}: expected tensor 'alike' for --ambiguity on "
+            "(scapo-data generate --ambiguity), found none"
+        )
 
 
 class _Scored:
@@ -160,6 +170,11 @@ class _Scored:
 
 
 def _errors(settings: Settings, fitted: Prepared, truth: Truth, rows: Rows) -> Errors:
+    if settings.ambiguity == "on":
+        single = replace(settings, ambiguity="off")
+        return score_best(
+            truth, rows, lambda *some: _errors(single, fitted, *some), fitted.frames.revolute
+        )
     errors = score(truth, rows, settings=settings, frames=fitted.frames, order=fitted.order)
     if fitted.canon is not None:
         errors |= score_compat(truth, rows, fitted.canon, fitted.frames)
