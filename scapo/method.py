@@ -16,7 +16,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 
 from scapo.categories import Category
-from scapo.drawing import PictureData
+from scapo.pictures import PictureData
 from scapo.types import Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "refine"]

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.drawing import Panel, PictureData
+from scapo.pictures import Panel, PictureData
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation, deform_all
 from scapo.paper.skinning import Bones

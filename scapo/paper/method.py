@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import Category, JointKind
-from scapo.drawing import PictureData
+from scapo.pictures import PictureData
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes

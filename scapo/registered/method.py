@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
-from scapo.drawing import PictureData
+from scapo.pictures import PictureData
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.registered.axis_deviation import settle_leans

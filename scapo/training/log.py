@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo import drawing as draw
-from scapo.drawing import PictureData
+from scapo import pictures as draw
 from scapo.method import AbstractMethod
+from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.store.checkpoint import array
 from scapo.store.files import canonical_json, write, write_bytes
