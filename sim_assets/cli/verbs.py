@@ -296,12 +296,22 @@ class Preview:
     """Only this one."""
     split: str | None = None
     """Only this one."""
+    by_ambiguity: bool = False
+    """Half of them samples that look alike under other turns, half that do not, apart; of data
+    made with --ambiguity."""
 
     def run(self, console: Console) -> int:
         """Draw it."""
         from sim_assets.inspect.preview import draw_preview
 
-        drawn = draw_preview(self.path, self.out, self.count, self.category, self.split)
+        drawn = draw_preview(
+            self.path,
+            self.out,
+            self.count,
+            self.category,
+            self.split,
+            by_ambiguity=self.by_ambiguity,
+        )
         console.print(f"{drawn} samples drawn in {self.out}", soft_wrap=True)
         return 0
 

@@ -242,11 +242,9 @@ class WholeSurface(AbstractEvidence):
         self.body, self.tolerance = body, tolerance
         self.true = Fit(object_T_turned=np.eye(4), state=state)
         rng = generator("ambiguity", body.thing.instance)
-        areas = np.array([body.thing.part_mesh(p).area for p in range(len(body.surfaces))])
+        areas = np.array([mesh.area for mesh in body.meshes])
         counts = np.maximum(rng.multinomial(WHOLE, areas / areas.sum()), 1)
-        self.chosen = [
-            rng.integers(len(s), size=n) for s, n in zip(body.surfaces, counts, strict=True)
-        ]
+        self.drawn = [body.draw(part, int(count), rng) for part, count in enumerate(counts)]
         self.part = np.repeat(np.arange(len(counts)), counts)
         self.surface = self._posed(self.true)
         self.own = self._open(self.surface, self.true)[0]
@@ -280,8 +278,8 @@ class WholeSurface(AbstractEvidence):
     def _posed(self, fit: Fit) -> Oriented:
         poses = fit.object_T_turned @ self.body.thing.pose(fit.state)
         out = []
-        for samples, chosen, pose in zip(self.body.surfaces, self.chosen, poses, strict=True):
-            points, normals = np.split(samples[chosen], 2, axis=1)
+        for drawn, pose in zip(self.drawn, poses, strict=True):
+            points, normals = np.split(drawn, 2, axis=1)
             out.append(
                 np.concatenate([points @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T], 1)
             )

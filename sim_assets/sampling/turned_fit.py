@@ -93,14 +93,12 @@ class Body:
         """Draw `samples` points of each part's surface."""
         self.thing, self.samples = thing, samples
         self.size = float(np.linalg.norm(thing.extents()))
-        bounds = thing.part_mesh(0).bounds
+        self.meshes = [thing.part_mesh(part) for part in range(len(thing.visuals))]
+        bounds = self.meshes[0].bounds
         self.centre, self.extents = bounds.mean(0), bounds[1] - bounds[0]
-        self.surfaces, self.trees, self.grids = [], [], []
-        for part in range(len(thing.visuals)):
-            surface = self._surface(part)
-            self.surfaces.append(surface)
-            self.trees.append(KDTree(self._keys(surface)))
-            self.grids.append(_Grid(surface[: self.samples, :3], self.size))
+        self.surfaces = [self._surface(part) for part in range(len(self.meshes))]
+        self.trees = [KDTree(self._keys(surface)) for surface in self.surfaces]
+        self.grids = [_Grid(surface[: self.samples, :3], self.size) for surface in self.surfaces]
         self.states = np.linspace(0, 1, STATES) * thing.upper[:, None]  # (J, K)
         joints = thing.category.joints
         self.motions = np.stack(
@@ -112,12 +110,15 @@ class Body:
 
     def _surface(self, part: int) -> Oriented:
         """Samples of a part's surface; of one that is not closed with both of its sides."""
-        mesh = self.thing.part_mesh(part)
-        rng = generator("ambiguity", self.thing.instance, part)
-        points, face = sample_surface(mesh, self.samples, rng)
-        out = np.concatenate([points, np.asarray(mesh.face_normals)[face]], 1)
+        out = self.draw(part, self.samples, generator("ambiguity", self.thing.instance, part))
         closed = all(visual.mesh.is_watertight for visual in self.thing.visuals[part])
         return out if closed else np.concatenate([out, out * [1, 1, 1, -1, -1, -1]])
+
+    def draw(self, part: int, count: int, rng: np.random.Generator) -> Oriented:
+        """Points of a part's surface at rest, uniform by area."""
+        mesh = self.meshes[part]
+        points, face = sample_surface(mesh, count, rng)
+        return np.concatenate([points, np.asarray(mesh.face_normals)[face]], 1)
 
     def _keys(self, surface: Oriented) -> Oriented:
         """What is near in these is near in space and faces the same way."""

@@ -11,7 +11,8 @@ from scapo.categories import category
 from scapo.geometry.camera import Intrinsics
 from sim_assets.generation.assets import procedural_assets
 from sim_assets.objects import ArticulatedObject, Visual
-from sim_assets.sampling.ambiguity import Alike, Ambiguity, Tolerance
+from sim_assets.sampling.ambiguity import Alike, Ambiguity
+from sim_assets.sampling.evidence import Tolerance
 from sim_assets.sampling.turned_fit import TURNS
 from sim_assets.sampling.viewpoints import look_along
 from tests.helpers.boxes import box, origin
