@@ -12,6 +12,7 @@ import io
 import json
 import os
 import secrets
+import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -84,6 +85,34 @@ class Counts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Seeds:
+    """Of what was drawn at random."""
+
+    training: int
+    calibration: int | None
+    bootstrap: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Digests:
+    """SHA-256 of what was read and written."""
+
+    data: str
+    predictions: str
+    scores: str | None = None
+    """None in reports of before it was kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bootstrap:
+    """How the intervals were made."""
+
+    resamples: int
+    seed: int
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
     """The JSON beside the scores."""
 
@@ -102,9 +131,9 @@ class Report:
     settings: dict[str, str]
     counts: Counts
     calibration: dict[str, Any] | None
-    seeds: dict[str, int | None]
+    seeds: Seeds
     part_order: tuple[int, ...] | None
-    digests: dict[str, str]
+    digests: Digests
     run: dict[str, Any]
     """The training, as the predictions' header has it."""
     commit: str
@@ -115,7 +144,7 @@ class Report:
     summary: dict[str, Summary]
     """By metric and unit, such as `iou_1`."""
     average_precision: dict[str, Any]
-    bootstrap: dict[str, str | int]
+    bootstrap: Bootstrap
 
 
 def side_file(scores: Path) -> Path:
@@ -255,8 +284,7 @@ def read_scores(path: Path) -> list[Scores]:
     except OSError as error:
         raise StoreError(f"{path}: expected gzipped CSV of scores, found {error}") from error
     frame = _read_frame(path, data)
-    digest = report.digests.get("scores")  # reports of before it was kept have none
-    if digest not in (None, sha256_bytes(data)):
+    if report.digests.scores not in (None, sha256_bytes(data)):
         raise StoreError(f"{path}: expected the scores of {side_file(path).name}, found others")
     out = []
     for key, rows in frame.groupby(list(COLUMNS[:6]), sort=True):
@@ -285,14 +313,16 @@ def _read_frame(path: Path, data: bytes) -> Any:  # noqa: ANN401
         "value": float,
     }
     try:
-        frame = pd.read_csv(
-            io.BytesIO(data),
-            compression="gzip",
-            keep_default_na=False,
-            na_values={"value": [""]},
-            dtype=cast("Any", types),
-        )
-    except (OSError, EOFError, ValueError, OverflowError, zlib.error) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of numbers that no integer can be
+            frame = pd.read_csv(
+                io.BytesIO(data),
+                compression="gzip",
+                keep_default_na=False,
+                na_values={"value": [""]},
+                dtype=cast("Any", types),
+            )
+    except (OSError, EOFError, ValueError, OverflowError, zlib.error, Warning) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise StoreError(f"{path}: expected gzipped CSV of scores, found {first}") from error
     if tuple(frame.columns) != COLUMNS:
@@ -310,8 +340,9 @@ def _read_frame(path: Path, data: bytes) -> Any:  # noqa: ANN401
                     f"found {text[:LONGEST_NAME]!r}"
                 )
         frame[name] = frame[name].map(from_cell)
-    if np.isinf(frame["value"]).any():
-        raise StoreError(f"{path}: value: expected finite numbers, found an infinite one")
+    values = frame["value"].dropna()
+    if not ((values >= 0) & (values < np.inf)).all():
+        raise StoreError(f"{path}: value: expected finite numbers of 0 or more, found another")
     return frame
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from bench.methods import all_methods
 from bench.tables.model import Cell, Marks, Row
 from bench.tables.paper import MEAN, Cells, Mismatch
 from bench.tables.results import Kind, Results, Sampled, Series, averaged, kind_of
-from bench.tables.spec import METHODS, ORDER, PAPER_METHODS, REFERENCE, TABLE_1
+from bench.tables.spec import PAPER_METHODS, PUBLISHED, REFERENCE, TABLE_1
 from scapo.text import one_line
 
 DATASET_ORDER = "label-order=dataset"
@@ -78,9 +79,19 @@ def our_row(
     )
 
 
+def titles() -> dict[str, tuple[str, int]]:
+    """Names of methods in scores -> what a table calls them, and their rank."""
+    return PUBLISHED | {name: (one.title, one.rank) for name, one in all_methods().items()}
+
+
+def title(method: str) -> str:
+    """What a table calls a method."""
+    return REFERENCE.get(method) or titles().get(method, (method, 0))[0]
+
+
 def display_name(series: Series) -> str:
     """What a table calls a series."""
-    name = METHODS.get(series.method, series.method)
+    name = title(series.method)
     if series.variant not in ("", "default"):
         name += f" ({series.variant})"
     if series.switches == DATASET_ORDER:
@@ -102,12 +113,13 @@ def marks_of(results: Results, series: Series) -> Marks | None:
 
 
 def in_order(rows: Sequence[Row]) -> list[Row]:
-    """In the paper's order of methods, each printed row before ours of that method."""
+    """By the rank of methods, each printed row before ours of that method; references last."""
+    order = [name for name, _ in sorted(titles().values(), key=lambda one: one[1])]
 
     def rank(row: Row) -> tuple[int, int]:
-        known = [i for i, name in enumerate(ORDER) if row.method.startswith(name)]
-        reference = any(row.method.startswith(METHODS[name]) for name in REFERENCE)
-        return (known[-1] if known else len(ORDER) + reference, row.source != "paper")
+        known = [i for i, name in enumerate(order) if row.method.startswith(name)]
+        reference = row.method.startswith(tuple(REFERENCE.values()))
+        return (known[-1] if known else len(order) + reference, row.source != "paper")
 
     return sorted(rows, key=rank)
 
@@ -140,7 +152,7 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
         budget = run.report.budget
         named = {_short(key.replace("_", " ")): value for key, value in sorted(budget.items())}
         cost = ", ".join(f"{key} {_short(value)}" for key, value in named.items())
-        name = METHODS.get(run.run.method, run.run.method)
+        name = title(run.run.method)
         variant = f" ({run.run.variant})" if run.run.variant else ""
         text = (
             f"{name}{variant}, {run.run.category} on {run.run.data}, "

@@ -53,5 +53,6 @@ def report_of(run, supervision=(), samples=SAMPLES):
         "seeds": {"training": run.seed, "calibration": None, "bootstrap": 0},
         "digests": {"data": "0" * 64, "predictions": "1" * 64}, "run": {}, "commit": "0abc",
         "machine": {"cpu": "a chip", "cores": 2}, "versions": {"numpy": "2"}, "summary": {},
-        "average_precision": {"rule": "mean"}, "bootstrap": {"resamples": 2000, "seed": 0},
+        "average_precision": {"rule": "mean"},
+        "bootstrap": {"resamples": 2000, "seed": 0, "unit": "instance"},
     }  # fmt: skip
