@@ -17,8 +17,25 @@ from jaxtyping import Float, Int
 from bench.scoring.scores import Errors, Rows
 from bench.scoring.truth import Truth
 from scapo.geometry.rigid import joint_motion
+from scapo.store import Split, StoreError
+from scapo.store.files import tensor_names
 
 Score = Callable[[Truth, Rows], Errors]
+
+
+def check_alike(split: Split) -> None:
+    """Refuse a split whose samples do not say which turns look alike.
+
+    Raises:
+        StoreError: Naming the shard that does not.
+    """
+    for shard in split.manifest.shards:
+        path = split.folder / shard.file
+        if "alike" not in tensor_names(path):
+            raise StoreError(
+                f"{path}: expected tensor 'alike' for --ambiguity on "
+                "(scapo-data generate --ambiguity), found none"
+            )
 
 
 def score_best(truth: Truth, rows: Rows, score: Score, revolute: np.ndarray) -> Errors:
@@ -28,7 +45,7 @@ def score_best(truth: Truth, rows: Rows, score: Score, revolute: np.ndarray) -> 
     rotation is predicted; on ties the truth, then the first turn.
 
     Args:
-        truth: With `alike`.
+        truth: Without `alike` there is the truth alone.
         rows: Predictions.
         score: What scores them.
         revolute: Which joints turn, (J,) bool.
