@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The data of the benchmark `sim-art/1` (CONTRACT 4): OUT/PART/CATEGORY/SPLIT, resumable.
+"""The data of the benchmark `sim-art/1`: OUT/PART/CATEGORY/SPLIT, resumable.
 
 `clean` is exact depth of an object that fills the picture, `sensor` a simulated depth camera at a
 drawn distance with an imperfect mask. What each split cost and holds is recorded in one JSON file.
@@ -16,6 +16,8 @@ from typing import Any, Literal, get_args
 
 from scapo.categories import CATEGORIES
 from scapo.store import write_bytes
+from scapo.store.json_records import from_json, read_json
+from scapo.text import one_line
 from sim_assets.generation.generate import Made, Running, generate, open_workers
 from sim_assets.generation.request import make_request, versions
 from sim_assets.options import DataOptions, SplitName
@@ -126,9 +128,10 @@ def make_benchmark(
         GenerateError: A folder holds something else, or a split cannot be made.
     """
     chosen, running = pieces(only), running or Running()
-    with open_workers(running) as pool:  # they take seconds to start: one set for all pieces
-        for piece in chosen:
-            request, assets = make_request(piece.category, piece.options(sizes or SIZES, backend))
+    asked = [make_request(p.category, p.options(sizes or SIZES, backend)) for p in chosen]
+    requests = [request for request, _ in asked]
+    with open_workers(running, *requests) as pool:  # one set for all pieces
+        for piece, (request, assets) in zip(chosen, asked, strict=True):
             settings = request.settings
             started = time.monotonic()
             made = generate(
@@ -142,6 +145,24 @@ def make_benchmark(
             done = Done(piece=piece, made=made, seconds=time.monotonic() - started)
             _record(out / RECORD, done)
             yield done
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Split:
+    """What is read of a split's entry."""
+
+    samples: int
+    bytes: int
+    seconds: float
+    digest: str
+    shards_kept: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Record:
+    """What is read of the record."""
+
+    splits: dict[str, _Split]
 
 
 def _record(path: Path, done: Done) -> None:
@@ -171,13 +192,11 @@ def read_record(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {"format": FORMAT, "benchmark": NAME, "splits": {}, "total": {}}
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, found {error}") from error
+    record = read_json(path)
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{path}: expected format {FORMAT!r}, found {found!r}")
+        raise ValueError(f"{path}: expected format {FORMAT!r}, found {one_line(repr(found), 200)}")
+    from_json(_Record, record, str(path))
     return record
 
 
