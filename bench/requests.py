@@ -187,8 +187,7 @@ class TrainRequest(Generic[M]):
     split: str = "train"
     """Split to train on."""
     val_split: str = "val"
-    """Split on which methods with a validation pass are validated; where the data lack it, every
-    tenth object of --split is held out for that. Others do not read it."""
+    """Split for methods with a validation pass; without it, every tenth object of --split."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, cuda:1, ..."""
     seed: int = 1
