@@ -116,6 +116,9 @@ def _made(manifest: Manifest) -> str:
     if isinstance(seen, dict):
         size = f"{seen['width']} x {seen['height']}"
         rows.append(("camera", f"{size}, fx {seen['fx']:.6g}, fy {seen['fy']:.6g}"))
+    alike = manifest.options.get("ambiguity")
+    if isinstance(alike, dict):
+        rows.append(("ambiguity", ", ".join(f"{k} {v:g}" for k, v in sorted(alike.items()))))
     rows += [(f"version of {name}", text) for name, text in sorted(manifest.versions.items())]
     table = _table(("option", "value"), rows)
     command = remake(manifest)
@@ -138,7 +141,7 @@ def remake(manifest: Manifest) -> str | None:
     if Intrinsics(**options["camera"]) != usual:
         flags["image_size"] = options["camera"]["width"]
     words = [f"--{name.replace('_', '-')} {value}" for name, value in flags.items()]
-    words += ["--color"] if options.get("color") else []
+    words += [f"--{name}" for name in ("color", "ambiguity") if options.get(name)]
     return f"scapo-data generate {manifest.category} --out OUT {' '.join(words)}"
 
 

@@ -28,6 +28,7 @@ from sim_assets.rendering.base import (
     RenderError,
     RenderRequest,
 )
+from sim_assets.sampling.ambiguity import Ambiguity
 from sim_assets.sampling.cloud import (
     FPS_POOL,
     Cloud,
@@ -87,6 +88,8 @@ class Settings:
     """A test split: eyeglasses then have a published grid of their own."""
     noise: Noise = "none"
     mask: Mask = "exact"
+    ambiguity: bool = False
+    """Say which turns look alike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,6 +122,9 @@ class SampleMaker:
         self.enough = pool * max(settings.points, LEAST_PIXELS)
         names = [field.name for field in fields(ViewOptions)]
         self.view_options = ViewOptions(**{name: getattr(settings, name) for name in names})
+        self.ambiguity = None
+        if settings.ambiguity:
+            self.ambiguity = Ambiguity(thing, settings.camera, settings.noise, settings.protocol)
         if renderer is not None:
             renderer.open(thing)
 
@@ -210,7 +216,14 @@ class SampleMaker:
             "joint_state": known.state.astype(np.float32),
             "visible": visible.astype(np.float32),
             "camera": np.array(settings.camera.row(), np.float32),
+            **self._alike(state, view),
         }
+
+    def _alike(self, state: np.ndarray, view: View) -> Row:
+        """The tensors of `ambiguity`, if they are asked for."""
+        if self.ambiguity is None:
+            return {}
+        return self.ambiguity.find(state, view.camera_T_object).row()
 
     def _enough(self, cloud: Cloud) -> bool:
         """Whether each part has the points it needs."""
