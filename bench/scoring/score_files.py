@@ -14,7 +14,7 @@ import os
 import secrets
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -332,6 +332,11 @@ def _read_frame(path: Path, data: bytes) -> Any:  # noqa: ANN401
         )
     if frame.drop(columns="value").isna().any(axis=None):
         raise StoreError(f"{path}: expected {len(COLUMNS)} cells in every row, found fewer")
+    return _checked(path, frame, names)
+
+
+def _checked(path: Path, frame: Any, names: Sequence[str]) -> Any:  # noqa: ANN401
+    """The rows with the names of these columns as they were written, values possible."""
     for name in names:
         for text in frame[name].unique():
             if not text.isprintable() or len(text) > LONGEST_NAME:

@@ -7,13 +7,13 @@ equations that cannot be used as they stand are named at the functions that corr
 
 from __future__ import annotations
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, joint_motion, mean_rotation, rigid, rotation_between
+from scapo.geometry.rotations import unitquat_to_rotmat
 from scapo.paper.heads import JointPairs
 
 
@@ -32,9 +32,7 @@ class Bones(nn.Module):
 
     def precision(self) -> Float[Tensor, "P 3 3"]:
         """Q of each bone, symmetric positive definite."""
-        orientation = roma.unitquat_to_rotmat(
-            torch.nn.functional.normalize(self.quaternion, dim=-1)
-        )
+        orientation = unitquat_to_rotmat(torch.nn.functional.normalize(self.quaternion, dim=-1))
         return orientation.mT @ (self.log_scale.exp()[..., None] * orientation)
 
     def weights(

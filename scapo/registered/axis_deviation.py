@@ -19,12 +19,12 @@ import logging
 from dataclasses import replace
 from itertools import product
 
-import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from scapo.geometry.points import gather
+from scapo.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from scapo.records import cat, take
 from scapo.registered.bundle_adjustment import (
     Candidate,
@@ -294,8 +294,8 @@ def _observe(
             for reach in reaches:
                 for _ in range(TURNS):
                     turned = _turn_onto(source, target, turned, mine, reach)
-        straight = roma.rotvec_to_rotmat(axes[j] * placement.state[:, j : j + 1])
-        extra = roma.rotmat_to_rotvec(straight.mT @ turned)
+        straight = rotvec_to_rotmat(axes[j] * placement.state[:, j : j + 1])
+        extra = rotmat_to_rotvec(straight.mT @ turned)
         turns.append(extra @ across_axis(axes[j]).T)
     return PartRotations(turn=torch.stack(turns, 1), seen=torch.stack(seen, 1))
 
@@ -310,7 +310,7 @@ def rotated_poses(
     middle = observed.turn.masked_fill(~observed.seen[..., None], torch.nan).nanmedian(0).values
     turn = (observed.turn - middle).nan_to_num()
     turn = bounded(turn, LARGEST)
-    extra = roma.rotvec_to_rotmat(spread_across(turn * observed.seen[..., None], template))
+    extra = rotvec_to_rotmat(spread_across(turn * observed.seen[..., None], template))
     pivot = template.pivot * placement.log_scale.exp()[:, None]
     rotation = torch.cat([straight.rotation[:, :1], straight.rotation[:, 1:] @ extra], 1)
     moved = (straight.rotation[:, 1:] - rotation[:, 1:]) @ pivot[..., None]
@@ -353,4 +353,4 @@ def _turn_onto(
     right = torch.einsum("bki,bk,bk->bi", across, gap, (1 - along) * weight)
     right = right + torch.einsum("bkic,bkc,bk->bi", moved, off, along * weight)
     step = damped_step(system, -right, torch.full_like(right, DAMPING))
-    return roma.rotvec_to_rotmat(bounded(step, MOST_TURN)) @ turned
+    return rotvec_to_rotmat(bounded(step, MOST_TURN)) @ turned

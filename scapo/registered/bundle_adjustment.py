@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import JointKind
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import map_tensors
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.gauge import along_main_directions, choose_axes, tells_frame
@@ -246,7 +246,7 @@ class _Free:
     def placement(self, axis: Float[Tensor, "J 3"]) -> Placement:
         along = (self.shift * axis).sum(-1, keepdim=True) * axis
         return Placement(
-            rotation=roma.rotvec_to_rotmat(self.turn) @ self.start.rotation,
+            rotation=rotvec_to_rotmat(self.turn) @ self.start.rotation,
             translation=self.translation,
             log_scale=self.log_scale,
             state=self.state,

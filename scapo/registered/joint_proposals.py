@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
 from scapo.geometry.points import gather, k_means
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import take
 from scapo.registered.motion_segmentation import OBSERVERS, gather_evidence, smooth
 from scapo.registered.pairwise import HIDDEN_COST, NearestGrid
@@ -185,7 +185,7 @@ def _motions(
     if kind == "prismatic":
         turn = torch.eye(3).to(direction).expand(1, len(step), 3, 3)
         return turn, step[None, :, None]
-    turn = roma.rotvec_to_rotmat(step).expand(len(pivots), -1, 3, 3)
+    turn = rotvec_to_rotmat(step).expand(len(pivots), -1, 3, 3)
     move = pivots[:, None] - (turn @ pivots[:, None, :, None])[..., 0]
     return turn, move[:, :, None]
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
-import roma
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
@@ -26,6 +25,7 @@ from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.pictures import PictureData
 from scapo.records import take
@@ -234,7 +234,7 @@ class RegisteredScapo(AbstractMethod):
         device, count = points.device, len(points)
         pick = torch.randint(FRAMES, (count,), generator=generator, device=device)
         turn = TURN * torch.randn(count, 3, generator=generator, device=device)
-        return roma.rotvec_to_rotmat(turn) @ frames[torch.arange(count, device=device), pick]
+        return rotvec_to_rotmat(turn) @ frames[torch.arange(count, device=device), pick]
 
     @torch.no_grad()
     def _target(self, points: Float[Tensor, "B K 3"], row: Int[Tensor, " B"]) -> Target:

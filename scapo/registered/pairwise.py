@@ -13,12 +13,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.geometry.points import gather
+from scapo.geometry.rotations import rotvec_to_rotmat, unitquat_to_rotmat
 from scapo.records import cat, take
 from scapo.registered.gauss_newton import by_turn, damped_step
 from scapo.registered.view_loss import match_weight, sharpened
@@ -68,7 +68,7 @@ def rotation_grid(count: int) -> Float[Tensor, "{count} 3 3"]:
         other * beta.sin(),
         other * beta.cos(),
     ]
-    return roma.unitquat_to_rotmat(torch.stack(quaternion, -1)).float()
+    return unitquat_to_rotmat(torch.stack(quaternion, -1)).float()
 
 
 def within(cosine_trace: Float[Tensor, "*B"], degrees: float) -> Tensor:
@@ -222,7 +222,7 @@ def plane_step(
     gradient = gradient + (spread * residual.flatten(-2)[..., None]).sum(-2)
     damping = DAMPING * system.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True) + NONE
     twist = damped_step(system, gradient, damping)
-    return roma.rotvec_to_rotmat(twist[..., :3]), twist[..., 3:]
+    return rotvec_to_rotmat(twist[..., :3]), twist[..., 3:]
 
 
 @torch.no_grad()

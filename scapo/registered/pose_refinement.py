@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import roma
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.geometry.points import gather
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
 from scapo.registered.gauss_newton import bounded, by_turn, damped_step
 from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
@@ -245,7 +245,7 @@ def _move(
             column += 3
     return replace(
         placement,
-        rotation=roma.rotvec_to_rotmat(turn) @ placement.rotation,
+        rotation=rotvec_to_rotmat(turn) @ placement.rotation,
         translation=placement.translation + bounded(step[:, 3:6], MOST_MOVE),
         log_scale=placement.log_scale + bounded(step[:, 6:POSE], MOST_SCALE),
         state=placement.state + step[:, POSE : POSE + joints].clamp(-MOST_STATE, MOST_STATE),

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import roma
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -19,6 +18,7 @@ from torch import Tensor, nn
 
 from scapo.categories import JointKind
 from scapo.geometry.points import farthest_points
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
 
 SPAN = (0.02, 0.98)
@@ -152,17 +152,17 @@ class ArticulatedTemplate(nn.Module):
 
     def own_directions(self, placement: Placement) -> Float[Tensor, "B J 3"]:
         """Unit axes of each view's own object, template frame."""
-        turn = roma.rotvec_to_rotmat(placement.deviation)
+        turn = rotvec_to_rotmat(placement.deviation)
         return (turn @ self.directions()[:, :, None])[..., 0]
 
     def _hinged(self, j: int, placement: Placement) -> Float[Tensor, "B 3 3"]:
         """How hinge j turns its part: from its rest about its own axis (`axis_deviation`)."""
         axis, state = self.directions()[j], placement.state[:, j : j + 1]
         if not bool(placement.deviation[:, j].any()):
-            return roma.rotvec_to_rotmat(axis * state)
-        aside = roma.rotvec_to_rotmat(placement.deviation[:, j])
-        onward = roma.rotvec_to_rotmat(axis * (state - self.rest[j]))
-        return aside @ onward @ aside.mT @ roma.rotvec_to_rotmat(axis * self.rest[j])
+            return rotvec_to_rotmat(axis * state)
+        aside = rotvec_to_rotmat(placement.deviation[:, j])
+        onward = rotvec_to_rotmat(axis * (state - self.rest[j]))
+        return aside @ onward @ aside.mT @ rotvec_to_rotmat(axis * self.rest[j])
 
     def part_poses(self, placement: Placement) -> PartPoses:
         """view_T_part of every part at the placement's states (corrected bone map of Sec. 3.2)."""
