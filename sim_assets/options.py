@@ -11,7 +11,7 @@ Protocol = Literal["joint", "isolated", "full"]
 Sampling = Literal["random", "fps"]
 Noise = Literal["none", "kinect", "disparity"]
 Mask = Literal["exact", "imperfect"]
-Preset = Literal["sim-art", "sim-art-sensor", "op-align", "eap"]
+Preset = Literal["sim-art", "sim-art-sensor", "sim-art-complete", "op-align", "eap"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +26,8 @@ class DataOptions:
     """Models: which axis the front (door, drawer, user side) faces; default: the source's."""
     scale: float | None = None
     """Models: metres per unit of the URDF; default: the source's."""
+    any_model: bool = False
+    """Models: take also those none of whose links, joints or semantics speaks of the category."""
     split: SplitName = "train"
     """Splits share no instance. Models are divided by a hash of their name, 70:10:20, where the
     folder has no splits of its own; fewer than ten go whole into the split asked for."""
@@ -42,8 +44,10 @@ class DataOptions:
     (EAP, OP-Align). full: the whole surface. Default: the preset's, joint for sim-art."""
     preset: Preset = "sim-art"
     """States, views and camera. sim-art: each category's travel and window, the object filling 50
-    to 90 % of the image. sim-art-sensor: the same windows, 640 x 480, a drawn distance. op-align,
-    eap: the published windows (isolated parts, farthest-point sampling, 640 x 480)."""
+    to 90 % of the image. sim-art-sensor: the same windows, 640 x 480, a drawn distance.
+    sim-art-complete: the whole surface of what sim-art shows, in the same states and places, turned
+    by any rotation. op-align, eap: the published windows (isolated parts, farthest-point sampling,
+    640 x 480)."""
     noise: Noise = "none"
     """Of the depth sensor. kinect: structured light (Nguyen et al. 2012). disparity: disturbed and
     rounded disparities (Handa et al. 2014). Both with flying pixels and holes."""

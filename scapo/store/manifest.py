@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
@@ -48,6 +48,10 @@ class Instance:
     """The URDF joint of each category joint."""
     sign: tuple[float, ...]
     """state = sign * (q - rest)."""
+    trait: str = ""
+    """What sets it apart from the training shapes, in `test-ood`; not stored where empty."""
+    account: tuple[str, ...] = ()
+    """How a model was read, one sentence each: joints, size, repairs; not stored where empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,7 +79,13 @@ class Manifest:
     def to_json(self) -> str:
         """Indented, sorted, with a final newline."""
         data = {"format": FORMAT, **asdict(self)}
+        data["instances"] = [_without_defaults(Instance, row) for row in data["instances"]]
         return json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n"
+
+
+def _without_defaults(kind: Any, row: dict[str, Any]) -> dict[str, Any]:  # noqa: ANN401
+    usual = {entry.name: entry.default for entry in fields(kind) if entry.default is not MISSING}
+    return {name: value for name, value in row.items() if usual.get(name, MISSING) != value}
 
 
 def shards_digest(shards: tuple[Shard, ...]) -> str:
@@ -114,7 +124,8 @@ def _record(cls: Any, data: object, where: str) -> Any:  # noqa: ANN401
     """A dataclass from JSON, each field checked against its annotation."""
     if not isinstance(data, dict):
         raise ManifestError(f"{where}: expected an object, found {type(data).__name__}")
-    hints = get_type_hints(cls)
+    usual = {entry.name for entry in fields(cls) if entry.default is not MISSING}
+    hints = {n: hint for n, hint in get_type_hints(cls).items() if n in data or n not in usual}
     missing = [name for name in hints if name not in data]
     if missing:
         raise ManifestError(f"{where}: expected field {missing[0]!r}, found none")

@@ -251,7 +251,7 @@ class Generate:
                 request,
                 assets,
                 folder,
-                versions(request.settings.backend, request.settings.protocol),
+                versions(request.settings.backend),
                 Running(
                     workers=self.workers,
                     engine=self.engine,

@@ -135,7 +135,7 @@ def make_benchmark(
                 request,
                 assets,
                 out / piece.name,
-                versions(settings.backend, settings.protocol),
+                versions(settings.backend),
                 running,
                 pool,
             )

@@ -21,6 +21,7 @@ from trimesh.visual import TextureVisuals
 from scapo.categories import category as find_category
 from scapo.types import Category
 from sim_assets.models import frames
+from sim_assets.models.account import account
 from sim_assets.models.frames import Vector
 from sim_assets.models.joints import (
     Reduction,
@@ -263,8 +264,21 @@ def _object(
             joint_names=tuple(joint.name for joint in joints),
             sign=tuple(rest.direction for rest in resting.rests),
             repairs=files.repairs.sentences(),
+            account=account(
+                resting.model.robot,
+                resting.model.known,
+                resting.reduction,
+                category,
+                _sides(visuals),
+                ratio,
+            ),
         ),
     )
+
+
+def _sides(parts: tuple[tuple[Visual, ...], ...]) -> Float[np.ndarray, " 3"]:
+    bounds = np.concatenate([visual.mesh.bounds for part in parts for visual in part])
+    return bounds.max(0) - bounds.min(0)
 
 
 def _moved(visual: Visual, a_T_b: Pose) -> Visual:

@@ -33,7 +33,7 @@ def sweep(category: str, places: tuple[int, ...] = ()) -> Iterator[dict[str, flo
     options = DataOptions(count=10**6, instances=OBJECTS, backend="maniskill")
     request, assets = make_request(category, options)
     shooters = [Shooter(None, asset.load(), request.settings) for asset in assets]
-    device = versions("maniskill", "joint")["device"]
+    device = versions("maniskill")["device"]
     _rates(shooters[:1], 1, 1, request.key)  # shaders are compiled
     for number in places or PLACES[cuda]:
         used = shooters[: min(OBJECTS, number)]

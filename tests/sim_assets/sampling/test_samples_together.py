@@ -72,7 +72,7 @@ def options(**given) -> DataOptions:
 
 def make(folder: Path, category: str, asked: DataOptions, **changes) -> Made:
     request, assets = make_request(category, asked)
-    found = versions(request.settings.backend, request.settings.protocol)
+    found = versions(request.settings.backend)
     return generate(request, assets, folder, found, replace(Running(workers=0), **changes))
 
 
