@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
@@ -84,9 +84,18 @@ def show_made(console: Console, made: Made, seconds: float) -> None:
         f"folder {made.folder}",
     ]
     console.print("\n".join(map(escape, lines)), highlight=False, soft_wrap=True)
-    for name, reason in made.failed.items():
-        line = f"[red]left out[/] {escape(name)}: {escape(reason)}"
-        console.print(line, highlight=False, soft_wrap=True)
+    for instance in manifest.instances:
+        if instance.account:
+            line = f"[green]taken[/] {escape(instance.id)}: {escape('; '.join(instance.account))}"
+            console.print(line, highlight=False, soft_wrap=True)
+    show_left_out(console, made.failed)
     lost = int(facts.get("samples_lost", 0))
     if lost:
         console.print(f"{lost} samples were lost with them", highlight=False)
+
+
+def show_left_out(console: Console, reasons: Mapping[str, str], what: str = "left out") -> None:
+    """One line for each object that is not there, with the reason."""
+    for name, reason in reasons.items():
+        line = f"[red]{what}[/] {escape(name)}: {escape(reason)}"
+        console.print(line, highlight=False, soft_wrap=True)

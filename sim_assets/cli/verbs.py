@@ -19,7 +19,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from sim_assets.cli.console import progress_bar, show_made, watched
+from sim_assets.cli.console import progress_bar, show_left_out, show_made, watched
 from sim_assets.options import DataOptions
 
 
@@ -30,13 +30,17 @@ class Benchmark:
     Started again after an interruption it goes on; the bytes are the same either way.
     """
 
-    name: tyro.conf.Positional[Literal["sim-art/1"]]
-    """Which one: 69,000 samples of the nine categories, about 1 GB."""
+    name: tyro.conf.Positional[Literal["sim-art/2", "sim-art/1"]]
+    """Which one: 117,000 samples of the nine categories, about 1.6 GB (docs/benchmark.md).
+    sim-art/1, its predecessor, is made by an older commit, which the message names."""
     out: Path
     """Folder of the benchmark."""
     only: tuple[str, ...] = ()
-    """Make only these: parts (clean, sensor), categories, splits, or several joined by /, such as
-    sensor/laptop/train."""
+    """Make only these: parts (clean, sensor, complete, real), categories, splits, or several joined
+    by /, such as sensor/laptop/train."""
+    real: Path | None = None
+    """Your own models, PATH/CATEGORY/ID/*.urdf: adds OUT/real/CATEGORY/test, 20 views of each. Their
+    category is told by PATH/index.csv, by themselves, or by the folder."""
     backend: Literal["auto", "sapien", "raycast"] = "sapien"
     """Renderer; the published digests are SAPIEN's."""
     workers: int | None = None
@@ -50,10 +54,21 @@ class Benchmark:
 
     def run(self, console: Console) -> int:
         """Make them, print a summary of each split, and name the objects that failed."""
-        from sim_assets.generation.benchmark import RECORD, make_benchmark, pieces
+        from sim_assets.generation.benchmark import (
+            RECORD,
+            Task,
+            check_name,
+            find_real,
+            make_benchmark,
+            pieces,
+        )
         from sim_assets.generation.generate import Running
 
-        total, failed = len(pieces(self.only)), False
+        check_name(self.name)
+        task = Task(only=self.only, backend=self.backend, real=self.real)
+        real = find_real(task)
+        total, failed = len(pieces(self.only, real)), False
+        show_left_out(console, {} if real is None else real.others, "no category")
         with progress_bar(console) as show:
             running = Running(
                 workers=self.workers,
@@ -62,7 +77,7 @@ class Benchmark:
                 strict=self.strict,
                 progress=show,
             )
-            made = make_benchmark(self.out, self.only, self.backend, running)
+            made = make_benchmark(self.out, task, running)
             for number, done in enumerate(made, 1):
                 console.print(f"{number}/{total} {done.piece.name}", highlight=False)
                 show_made(console, done.made, done.seconds)
@@ -189,6 +204,8 @@ class Check:
     """Which axis the front faces."""
     scale: float | None = None
     """Metres per unit of the URDF."""
+    any_model: bool = False
+    """With a category: accept also models none of whose links, joints or semantics speaks of it."""
     workers: int = os.cpu_count() or 1
     """Processes."""
 
@@ -199,12 +216,18 @@ class Check:
         colors = {"accepted": "green", "repaired": "yellow", "refused": "red"}
 
         def show(result: Result) -> None:
-            why = result.reason or "; ".join(result.repairs)
+            why = result.reason or "; ".join(result.account or result.repairs)
             status = f"[{colors[result.status]}]{result.status:8}[/]"
             line = f"{status}  {escape(result.path)}  {escape(why)}".rstrip()
             console.print(line, highlight=False, soft_wrap=True)
 
-        options = Options(category=self.category, up=self.up, front=self.front, scale=self.scale)
+        options = Options(
+            category=self.category,
+            up=self.up,
+            front=self.front,
+            scale=self.scale,
+            any_model=self.any_model,
+        )
         results = check(self.path, options, workers=self.workers, on_result=show)
         if self.json is not None:
             write_report(results, self.json)

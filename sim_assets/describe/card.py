@@ -122,6 +122,8 @@ def remake(manifest: Manifest) -> str | None:
     options = manifest.options
     if options.get("source") not in ("procedural", "urdf") or "camera" not in options:
         return None
+    if "chosen_by" in options:
+        return f"scapo-data {options['chosen_by']} FOLDER --only real/{manifest.category} --out OUT"
     source = "FOLDER" if options["source"] == "urdf" else "procedural"
     flags = {"source": source, "split": manifest.split, "count": manifest.count}
     if manifest.statistics.get("samples_lost"):
@@ -133,7 +135,7 @@ def remake(manifest: Manifest) -> str | None:
     if Intrinsics(**options["camera"]) != usual:
         flags["image_size"] = options["camera"]["width"]
     words = [f"--{name.replace('_', '-')} {value}" for name, value in flags.items()]
-    words += ["--color"] if options.get("color") else []
+    words += [f"--{name.replace('_', '-')}" for name in ("color", "any_model") if options.get(name)]
     return f"scapo-data generate {manifest.category} --out OUT {' '.join(words)}"
 
 

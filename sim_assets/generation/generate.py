@@ -38,6 +38,7 @@ from sim_assets.generation.shard import (
 )
 
 Progress = Callable[[str, int, int], None]
+Workers = AbstractPool[Any, Any]
 
 
 def _silent(what: str, done: int, total: int) -> None:
