@@ -44,7 +44,7 @@ class Account:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Origin:
-    """Where an object came from (the manifest's instance record, CONTRACT 3)."""
+    """Where an object came from (the manifest's instance record, docs/data-format.md)."""
 
     source: str
     """Path relative to the source folder, or the generator and its seed."""

@@ -11,7 +11,7 @@ Protocol = Literal["joint", "isolated", "full"]
 Sampling = Literal["random", "fps"]
 Noise = Literal["none", "kinect", "disparity"]
 Mask = Literal["exact", "imperfect"]
-Preset = Literal["sim-art", "sim-art-sensor", "sim-art-complete", "op-align", "eap"]
+PresetName = Literal["sim-art", "sim-art-sensor", "sim-art-complete", "op-align", "eap"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +42,7 @@ class DataOptions:
     protocol: Protocol | None = None
     """joint: the depth image of the whole object. isolated: each part rendered alone, and merged
     (EAP, OP-Align). full: the whole surface. Default: the preset's, joint for sim-art."""
-    preset: Preset = "sim-art"
+    preset: PresetName = "sim-art"
     """States, views and camera. sim-art: each category's travel and window, the object filling 50
     to 90 % of the image. sim-art-sensor: the same windows, 640 x 480, a drawn distance.
     sim-art-complete: the whole surface of what sim-art shows, in the same states and places, turned

@@ -7,7 +7,7 @@ What `evaluate` and `explain` share: the request, its data, the frames of the me
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,28 +15,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from bench.requests import Request, Settings
 from bench.scoring.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.scoring.compat_files import Canon, check_record, fit_canon, score_compat
 from bench.scoring.predictions import Header, Predictions, read_prediction_header
 from bench.scoring.score_files import Run, side_file, write_report, write_rows, writing
-from bench.scoring.scores import Errors, Frames, Rows, Settings, score
+from bench.scoring.scores import Errors, Frames, Rows, score
 from bench.scoring.summary import summarise
 from bench.scoring.truth import Truth, blocks, revolute, symmetry
 from bench.statistics import BOOTSTRAP_SEED
 from scapo.store import Split, StoreError, open_split, sha256_file
 from scapo.store.provenance import commit, machine
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Request:
-    """What to score, how, and where the scores go."""
-
-    predictions: Path
-    data: Path
-    out: Path
-    split: str = "test"
-    calibration: Path | None = None
-    settings: Settings = field(default_factory=Settings)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

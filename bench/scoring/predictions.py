@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Predictions files: the header, the tensors, and the refusal of what is not one.
 
-One safetensors file, written by any program (CONTRACT 3, docs/bring-your-own-method.md). Every
+One safetensors file, written by any program (docs/bring-your-own-method.md). Every
 complaint is one line: `file: tensor: expected, found`. A sample whose whole row of a tensor is
 NaN has no answer there: it is counted and its scores are empty.
 
-Which tensors a predictions file may hold, and which values an answer may have (CONTRACT 3).
+Which tensors a predictions file may hold, and which values an answer may have.
 """
 
 from __future__ import annotations

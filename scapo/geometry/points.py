@@ -153,7 +153,7 @@ def farthest_points(
     if not 0 <= start < points.shape[-2]:
         raise ValueError(f"sampling: expected a start below {points.shape[-2]}, found {start}")
     # On a CPU each of the many small steps would be compiled by itself, for minutes.
-    spread = uncompiled(_spread) if points.device.type == "cpu" else _spread
+    spread = _spread_as_it_is if points.device.type == "cpu" else _spread
     return spread(points, count, start)
 
 
@@ -167,6 +167,9 @@ def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tens
         chosen = distance.argmax(-1)
         indices.append(chosen)
     return torch.stack(indices, -1)
+
+
+_spread_as_it_is = uncompiled(_spread)
 
 
 MEAN_RADIUS = 0.25

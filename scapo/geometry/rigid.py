@@ -10,7 +10,7 @@ from typing import cast
 
 import roma
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from scapo.types import JointKind
@@ -158,11 +158,3 @@ def random_rotations(
     """Uniform on SO(3), from normalised Gaussian quaternions, on the generator's device."""
     quaternion = torch.randn(count, 4, generator=generator, device=generator.device, dtype=dtype)
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
-
-
-def is_rotation(matrix: Float[Tensor, "*B 3 3"], tolerance: float = 1e-3) -> Bool[Tensor, "*B"]:
-    """Whether R R^T = I within `tolerance` per entry and det > 0; False for NaN."""
-    matrix = matrix.double()  # no determinant in half precision on the CPU
-    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-    orthogonal = ((matrix @ matrix.mT - eye).abs() < tolerance).all(-1).all(-1)
-    return orthogonal & (torch.linalg.det(matrix) > 0)

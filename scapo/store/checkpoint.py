@@ -9,10 +9,9 @@ file so that a killed run can never pair the weights of one step with the state 
 from __future__ import annotations
 
 import platform
-import typing
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from torch import Tensor, nn
 
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.store.files import CHECKPOINT, Arrays, Header, read, write
-from scapo.store.schema import StoreError
+from scapo.store.json_records import StoreError, from_json
 
 T = TypeVar("T")
 
@@ -123,23 +122,6 @@ def config_from(kind: type[T], data: object, where: str) -> T:
     """A configuration dataclass from its JSON form, nested ones included.
 
     Raises:
-        StoreError: A field is unknown; missing ones take their default.
+        StoreError: A field is unknown or of another type; missing ones take their default.
     """
-    if not isinstance(data, dict):
-        raise StoreError(f"{where}: expected an object, found {type(data).__name__}")
-    hints = typing.get_type_hints(kind)
-    names = {item.name for item in fields(kind)}  # pyright: ignore[reportArgumentType]
-    unknown = sorted(set(data) - names)
-    if unknown:
-        raise StoreError(f"{where}: expected fields of {kind.__name__}, found {unknown[0]!r}")
-    return kind(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in data})
-
-
-def _value(hint: Any, value: object, where: str) -> object:  # noqa: ANN401
-    if isinstance(hint, type) and is_dataclass(hint):
-        return config_from(hint, value, where)
-    return _frozen(value)
-
-
-def _frozen(value: object) -> object:
-    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
+    return from_json(kind, data, where, others="refuse", link=".")

@@ -50,7 +50,11 @@ def sha256_file(path: Path) -> str:
 
 
 def write_bytes(path: Path | str, data: bytes) -> None:
-    """Write through a temporary name in the same folder, flushed to disk before the rename."""
+    """Write through a temporary name in the same folder, flushed to disk before the rename.
+
+    Raises:
+        OSError: It cannot be written; the file it names is `path`.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
@@ -60,6 +64,8 @@ def write_bytes(path: Path | str, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:  # a full disk is reported without a name, or with the temporary one
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):  # usually gone; else the first error is the one to report
             temporary.unlink()

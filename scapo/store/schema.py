@@ -9,7 +9,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from scapo.geometry.matrices import is_rigid
+from scapo.store.json_records import StoreError
 from scapo.store.manifest import Manifest
+
+__all__ = ["LAYOUT", "UNLABELLED", "StoreError", "check_samples", "check_shape", "sample_shapes"]
 
 UNLABELLED = 255
 """Part index of background and unlabelled points on disk; -1 in memory."""
@@ -30,10 +34,6 @@ LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "instance": ("int32", ()),
 }
 """dtype and shape of one sample's tensors; on disk the samples of a shard are stacked."""
-
-
-class StoreError(ValueError):
-    """A file is not what it should be: `path: what was expected, what was found`."""
 
 
 @runtime_checkable
@@ -128,20 +128,9 @@ def _impossible(name: str, array: np.ndarray, manifest: Manifest) -> tuple[str, 
             norm = np.linalg.norm(array, axis=-1)
         return "a unit vector", ~(abs(norm - 1) < TOLERANCE)
     if name == "camera_T_part":
-        return "a rigid motion", ~_is_rigid(array)
+        return "a rigid motion", ~is_rigid(array, TOLERANCE)
     if name == "camera":
         lower = np.array([0, 0, -np.inf, -np.inf, 0, 0])
         wanted = "fx, fy, cx, cy, width, height with positive focal lengths and size"
         return wanted, ~np.all((array > lower) & np.isfinite(array), axis=-1)
     return "a finite number", ~np.isfinite(array)
-
-
-def _is_rigid(pose: np.ndarray) -> np.ndarray:
-    """Whether the last row is 0 0 0 1 and the rest a rotation and a finite translation."""
-    finite = np.asarray(np.isfinite(pose).all((-1, -2)))
-    pose = np.where(finite[..., None, None], pose, 0).astype(np.float64)
-    rotation = pose[..., :3, :3]
-    gap = rotation @ rotation.swapaxes(-1, -2) - np.eye(3)
-    proper = (abs(gap) < TOLERANCE).all((-1, -2)) & (np.linalg.det(rotation) > 0)
-    last = (abs(pose[..., 3, :] - np.array([0, 0, 0, 1])) < TOLERANCE).all(-1)
-    return finite & proper & last

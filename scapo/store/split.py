@@ -23,7 +23,7 @@ from scapo.store.files import (
     require,
     sha256_file,
 )
-from scapo.store.manifest import Manifest, ManifestError, read_manifest
+from scapo.store.manifest import Manifest, read_manifest
 from scapo.store.schema import LAYOUT, StoreError, check_samples, sample_shapes
 
 
@@ -37,10 +37,7 @@ class Split:
             StoreError: There is no manifest there, or it is not valid.
         """
         self.folder = folder
-        try:
-            self.manifest: Manifest = read_manifest(folder / "manifest.json")
-        except ManifestError as error:
-            raise StoreError(str(error)) from error
+        self.manifest: Manifest = read_manifest(folder / "manifest.json")
 
     def shards(self, names: tuple[str, ...] | None = None) -> Iterator[Arrays]:
         """Arrays of each shard in order, checked against the manifest and the layout.

@@ -15,7 +15,7 @@ from typing import Any, Literal, cast
 import torch
 from torch import Tensor
 
-from scapo.geometry.numerics import at_least_float32, matrix_products
+from scapo.geometry.numerics import at_least_float32, before_compiling, matrix_products
 from scapo.method import AbstractMethod
 
 Precision = Literal["float32", "bfloat16", "float16"]
@@ -74,6 +74,7 @@ def changed(forward: Callable[..., Any], arithmetic: Arithmetic, kind: str) -> C
 
 def compiled(forward: Callable[..., Any], kind: str) -> Callable[..., Any]:
     """By torch.compile, one graph per shape; CUDA graphs take the launches away on CUDA."""
+    before_compiling()
     mode = "reduce-overhead" if kind == "cuda" else "default"
     # A method meets few shapes (whole, cropped, decoded clouds), each of them at every step.
     torch._dynamo.config.cache_size_limit = max(32, torch._dynamo.config.cache_size_limit)

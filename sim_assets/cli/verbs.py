@@ -39,8 +39,8 @@ class Benchmark:
     """Make only these: parts (clean, sensor, complete, real), categories, splits, or several joined
     by /, such as sensor/laptop/train."""
     real: Path | None = None
-    """Your own models, PATH/CATEGORY/ID/*.urdf: adds OUT/real/CATEGORY/test, 20 views of each. Their
-    category is told by PATH/index.csv, by themselves, or by the folder."""
+    """Your own models, PATH/CATEGORY/ID/*.urdf: adds OUT/real/CATEGORY/test, 20 views of each.
+    Their category is told by PATH/index.csv, by themselves, or by the folder."""
     backend: Literal["auto", "sapien", "raycast"] = "sapien"
     """Renderer; the published digests are SAPIEN's."""
     workers: int | None = None

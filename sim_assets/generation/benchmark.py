@@ -22,9 +22,9 @@ from scapo.store import write_bytes
 from sim_assets.generation.assets import Asset
 from sim_assets.generation.generate import Made, Running, Workers, generate, open_workers
 from sim_assets.generation.plan import Request
-from sim_assets.generation.real import RealModels, real_models, readable
+from sim_assets.generation.real import RealModels, readable, real_models
 from sim_assets.generation.request import make_request, versions
-from sim_assets.options import DataOptions, Preset, SplitName
+from sim_assets.options import DataOptions, PresetName, SplitName
 
 NAME = "sim-art/2"
 FORMAT = "scapo-benchmark/1"
@@ -37,7 +37,7 @@ OLD_COMMIT = "01c5925"
 SEED = 2
 """Of the data, whatever the training seed."""
 Part = Literal["clean", "sensor", "complete", "real"]
-PRESETS: dict[Part, Preset] = {
+PRESETS: dict[Part, PresetName] = {
     "clean": "sim-art",
     "sensor": "sim-art-sensor",
     "complete": "sim-art-complete",

@@ -122,7 +122,7 @@ def generate(
                 write_card(folder)
             return complete
         entries, refused = ledger.entries(assets) or _describe(
-            workers, assets, request.instances, running
+            workers, assets, request.instances, (running, ledger.refused())
         )
         if not entries:
             why = "; ".join(refused.values())
@@ -147,7 +147,9 @@ def _complete(ledger: Ledger, finished: Mapping[str, ShardDone]) -> Made | None:
         return None
     if any(shard.file not in finished for shard in manifest.shards):
         return None
-    return Made(folder=ledger.folder, manifest=manifest, kept=len(finished))
+    return Made(
+        folder=ledger.folder, manifest=manifest, failed=manifest.left_out, kept=len(finished)
+    )
 
 
 def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Running) -> Made:
@@ -176,24 +178,29 @@ def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Ru
     made = _render(ledger, pool, [job for job in jobs if job.plan.file not in kept], running)
     shards = [{**kept, **made}[job.plan.file] for job in jobs]
     failed = {name: why for shard in shards for name, why in shard.failed.items()}
-    manifest = _manifest(ledger, options, request, used, shards, len(work.refused))
+    manifest = replace(
+        _manifest(ledger, options, request, used, shards, len(work.refused)),
+        left_out={**work.refused, **failed},
+    )
     ledger.finish(manifest, [shard.file for shard in shards if not shard.count])
     write_card(ledger.folder)
-    return Made(
-        folder=ledger.folder,
-        manifest=manifest,
-        failed={**work.refused, **failed},
-        kept=len(kept),
-    )
+    return Made(folder=ledger.folder, manifest=manifest, failed=manifest.left_out, kept=len(kept))
 
 
 def _describe(
-    pool: AbstractPool[Any, Any], assets: Sequence[Asset], wanted: int, running: Running
+    pool: AbstractPool[Any, Any],
+    assets: Sequence[Asset],
+    wanted: int,
+    how: tuple[Running, Mapping[str, str]],
 ) -> tuple[tuple[Entry, ...], dict[str, str]]:
-    """Read objects until there are enough; those that cannot be read come with the reason."""
+    """Read objects until there are enough; those that cannot be read come with the reason.
+
+    Those that an earlier run refused stay refused: others have taken their place.
+    """
+    running, before = how
     found: dict[str, Entry] = {}
-    refused: dict[str, str] = {}
-    waiting = list(assets)
+    refused: dict[str, str] = dict(before)
+    waiting = [asset for asset in assets if asset.name not in refused]
     running.progress("objects", 0, wanted)
     while waiting and len(found) < wanted:
         batch, waiting = waiting[: wanted - len(found)], waiting[wanted - len(found) :]

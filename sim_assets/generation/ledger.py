@@ -103,6 +103,13 @@ class Ledger:
         )
         return entries, self.plan["refused"]
 
+    def refused(self) -> dict[str, str]:
+        """Objects that an earlier run refused, with the reason, beside its finished manifest."""
+        if self.manifest is None:
+            return {}
+        shown = {record.id for record in self.manifest.instances}
+        return {n: why for n, why in self.manifest.left_out.items() if n not in shown}
+
     def begin(self, entries: Sequence[Entry], refused: Mapping[str, str]) -> None:
         """Record the objects before the first shard is made.
 
@@ -110,8 +117,9 @@ class Ledger:
             GenerateError: A finished data set is there, made from other objects.
         """
         if self.manifest is not None:
-            before = {(record.id, record.sha256) for record in self.manifest.instances}
-            if not before <= {(entry.instance.id, entry.instance.sha256) for entry in entries}:
+            before = [(record.id, record.sha256) for record in self.manifest.instances]
+            there = [(entry.instance.id, entry.instance.sha256) for entry in entries]
+            if there[: len(before)] != before:
                 raise GenerateError(
                     f"{self.folder}: expected the objects of its manifest, found others; choose "
                     "another folder or delete this one"

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib import metadata
 from math import ceil
-from pathlib import Path
 
 from scapo.categories import category as find_category
 from sim_assets.generation.assets import Asset, folder_assets, procedural_assets
@@ -14,11 +13,11 @@ from sim_assets.generation.plan import Request
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import resolve_backend
 from sim_assets.rendering.base import Backend
-from sim_assets.sampling.presets import camera, rules
+from sim_assets.sampling.presets import camera, find_preset
 from sim_assets.sampling.samples import Settings
 
 SAMPLES_PER_INSTANCE = 50
-"""By default, as the benchmark's training split (CONTRACT 4)."""
+"""By default, as the benchmark's training split (docs/benchmark.md)."""
 MIN_IMAGE, MAX_IMAGE = 32, 4096
 
 
@@ -78,12 +77,10 @@ def versions(backend: Backend | None) -> dict[str, str]:
 
 
 def _settings(options: DataOptions) -> Settings:
-    preset = rules(options.preset)
+    preset = find_preset(options.preset)
     protocol = options.protocol or preset.protocol
     if preset.paired and protocol != "full":
-        raise ValueError(
-            f"protocol: expected full with preset {options.preset}, found {protocol}"
-        )
+        raise ValueError(f"protocol: expected full with preset {options.preset}, found {protocol}")
     needed = protocol != "full" or preset.paired
     if protocol == "full" and (options.noise, options.mask) != ("none", "exact"):
         raise ValueError(

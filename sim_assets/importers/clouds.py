@@ -3,7 +3,7 @@
 
 Their camera looks along -z with y up (OpenGL); ours along z with y down. Their part frames differ
 from ours by a constant turn, chosen so that the swap symmetry that is published for their frames is
-that of CONTRACT 1 in ours: `turned` applies it.
+that of our object frame: `turned` applies it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labelled clouds of other people's sets as splits in our layout (CONTRACT 3).
+"""Labelled clouds of other people's sets as splits in our layout (docs/data-format.md).
 
 Each file of the set is one sample. The points are drawn by a generator that the file's name seeds,
 so a sample does not depend on which other files are there. A split is written beside its place and

@@ -28,7 +28,7 @@ from sim_assets.models.validate import AssetError, Repairs, refuse
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import make_renderer
-from sim_assets.sampling.samples import Shooter, ViewError
+from sim_assets.sampling.samples import SampleMaker, ViewError
 
 FORMAT = "scapo-check/1"
 Status = Literal["accepted", "repaired", "refused"]
@@ -215,7 +215,7 @@ def show(urdf: Path, thing: ArticulatedObject) -> None:
     request, _ = make_request(thing.category.name, DataOptions(count=1, backend="raycast"))
     with make_renderer("raycast") as renderer:
         try:
-            list(Shooter(renderer, thing, request.settings).shots([("check",)]))
+            list(SampleMaker(renderer, thing, request.settings).render_views([("check",)]))
         except ViewError as error:
             reason = str(error).removeprefix(f"{thing.instance}: expected ")
             raise AssetError(f"{urdf}: expected {reason}") from error

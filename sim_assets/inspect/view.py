@@ -39,7 +39,7 @@ FROM_FRONT, FROM_CAMERA = np.array([-1.0, -0.75, 0.6]), np.array([0.0, 0.0, -1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Shown:
+class DisplayedSample:
     """One sample, camera frame."""
 
     points: Float[np.ndarray, "N 3"]
@@ -74,7 +74,7 @@ class Stage:
     """A frame per part of the object, above its meshes."""
     meshes: list[Any] = field(default_factory=list)
 
-    def draw(self, shown: Shown, upright: bool) -> None:
+    def draw(self, shown: DisplayedSample, upright: bool) -> None:
         """Put a sample in the place of the one before; `upright` in the object frame."""
         upright = upright and shown.placed
         self.scene.set_up_direction("+z" if upright else "-y")
@@ -163,7 +163,7 @@ class Stage:
         )
 
 
-def look(camera: Any, shown: Shown, upright: bool) -> None:  # noqa: ANN401
+def look(camera: Any, shown: DisplayedSample, upright: bool) -> None:  # noqa: ANN401
     """Where browsers that connect look from: from the front, or from the camera's side."""
     centre = np.median(shown.points, axis=0).astype(float)
     upright = upright and shown.placed
@@ -323,14 +323,14 @@ class Viewer:
             self._hide()
             self._pose()
 
-    def _shown(self) -> Shown:
+    def _shown(self) -> DisplayedSample:
         row, part = self.row, self.row["part"]
         digits = "".join(color[1:] for color in (*PART_COLORS, BACKGROUND))
         colors = np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 3)
         paint = colors[np.where(part < 0, len(PART_COLORS), part % len(PART_COLORS))]
         if self.paint_box.value == PAINTS[1] and "color" in row:
             paint = row["color"]
-        return Shown(
+        return DisplayedSample(
             points=row["points"],
             colors=paint,
             camera_T_object=row["camera_T_part"][0].astype(float),

@@ -10,13 +10,13 @@ import torch
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
-from scapo.geometry.rigid import apply, invert, is_rotation, joint_motion
+from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Step
 from scapo.paper.autoencoder import EncoderConfig
 from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.hinged import plates
-from tests.helpers.strategies import generator, rigid_motions
+from tests.helpers.strategies import generator, is_rotation, rigid_motions
 from tests.helpers.tiny import TINY, tiny
 
 STAGES = (CANONICALISE, ARTICULATE)

@@ -52,8 +52,10 @@ class Trap:
             file.write(f"{self.name}\n")
         loads = self.counter.read_text().split().count(self.name)
         if self.how and loads > self.after:
-            if self.how == "die":
+            if self.how == "die" or (self.how == "die once" and loads == self.after + 1):
                 os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "die once":
+                return laptop(self.name)
             if self.how == "hang":
                 time.sleep(600)
             raise ValueError(f"{self.name}: expected to be good, found {self.how}")
@@ -194,6 +196,45 @@ def test_objects_that_die_hang_or_fail_cost_themselves_only(tmp_path):
         generate(request, [laptop_asset(i) for i in range(6)], folder, VERSIONS, HERE)
 
 
+def test_a_worker_that_is_killed_changes_nothing(tmp_path):
+    """Killed while it describes one object and while it renders another: the same bytes."""
+    whole = generate(plain(20, 4), traps(tmp_path, [""] * 4), tmp_path / "whole", VERSIONS, HERE)
+    (tmp_path / "loads").unlink()
+    assets = traps(tmp_path, ["", "die once", "die once", ""])
+    assets[1] = replace(assets[1], after=0)
+    made = generate(plain(20, 4), assets, tmp_path / "killed", VERSIONS, Running(workers=2))
+    assert made.failed == {}
+    assert content(made.folder) == content(whole.folder)
+    loads = (tmp_path / "loads").read_text().split()
+    assert [loads.count(asset.name) for asset in assets] == [
+        3,
+        4,
+        3,
+        2,
+    ]  # a shard is done again whole
+
+
+def test_what_was_refused_is_said_again_by_every_later_run(tmp_path):
+    """Another object has taken its place, so the data set is whole; it is not silent."""
+    assets = traps(tmp_path, ["", "die", "raise", "", ""], after=0)
+    request = replace(plain(12, 2), instances=3)
+    folder = tmp_path / "split"
+    made = generate(request, assets, folder, VERSIONS, Running(workers=1))
+    refused = {
+        "object1": "its process was ended by SIGKILL",
+        "object2": "object2: expected to be good, found raise",
+    }
+    assert made.failed == refused
+    assert made.manifest.left_out == refused
+    before = content(folder)
+    good = [replace(asset, how="") for asset in assets]
+    for _ in range(2):
+        again = generate(request, good, folder, VERSIONS, HERE)
+        assert again.failed == refused
+        assert again.kept == len(again.manifest.shards)
+        assert content(folder) == before
+
+
 def laptop_asset(index: int) -> ProceduralAsset:
     return ProceduralAsset(category="laptop", split="train", seed=9, index=index)
 
@@ -247,7 +288,7 @@ def test_interrupted_then_killed_then_finished_gives_the_same_bytes(tmp_path, re
     folder = tmp_path / "laptop/train"
     process, errors = stop(tmp_path, repository, 1, signal.SIGINT)
     assert process.returncode == 130
-    assert errors.splitlines()[-1].endswith("takes it up where it was")
+    assert errors.splitlines()[-1].endswith("batches it up where it was")
     assert "Traceback" not in errors
     assert json.loads((folder / PLAN).read_text())["identity"]["count"] == 600
     process, _ = stop(tmp_path, repository, 3, signal.SIGKILL)

@@ -13,7 +13,7 @@ from sim_assets.generation.generate import Running, generate
 from sim_assets.generation.ledger import GenerateError
 from sim_assets.generation.plan import Piece
 from sim_assets.generation.request import make_request
-from sim_assets.generation.shard import shoot_piece
+from sim_assets.generation.shard import render_piece
 from sim_assets.generation.stream import stream
 from sim_assets.options import DataOptions
 
@@ -71,6 +71,6 @@ def test_a_model_that_has_changed_since_the_plan_is_refused():
     other = replace(entry, instance=replace(entry.instance, sha256="f" * 64))
     piece = Piece(entry=other, index=0, first=0, views=1)
     with pytest.raises(ValueError, match="they have changed since this data set was begun"):
-        shoot_piece(request, piece, None, lambda label, amount: None)
-    shots = shoot_piece(request, replace(piece, entry=entry), None, lambda label, amount: None)
-    assert len(shots) == 1
+        render_piece(request, piece, None, lambda label, amount: None)
+    views = render_piece(request, replace(piece, entry=entry), None, lambda label, amount: None)
+    assert len(views) == 1

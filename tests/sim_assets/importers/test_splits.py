@@ -43,7 +43,7 @@ PUBLISHED = {
     "eyeglasses": np.diag([1.0, -1, -1]),
     "laptop_h": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
 }
-"""Swap symmetries in the sets' own part frames (PROTOCOL 1.2)."""
+"""Swap symmetries in the sets' own part frames (docs/protocol.md)."""
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

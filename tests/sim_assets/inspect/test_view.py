@@ -26,7 +26,7 @@ from sim_assets.generation.build import build
 from sim_assets.generation.generate import Running, generate
 from sim_assets.generation.request import make_request, versions
 from sim_assets.inspect import view
-from sim_assets.inspect.view import Shown, Viewer
+from sim_assets.inspect.view import DisplayedSample, Viewer
 from sim_assets.options import DataOptions
 from tests.helpers.browser import open_page
 
@@ -168,7 +168,7 @@ def test_the_size_of_a_cloud_is_not_that_of_its_stray_points():
     points = np.zeros((1000, 3), np.float32)
     points[:, 0] = np.linspace(0, 1, 1000)
     points[5] = 50
-    shown = Shown(
+    shown = DisplayedSample(
         points=points,
         colors=np.zeros((1000, 3), np.uint8),
         camera_T_object=np.full((4, 4), np.nan),

@@ -16,7 +16,7 @@ from sim_assets.generation.shard import make_renderer
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import resolve_backend
 from sim_assets.rendering.base import RenderError
-from sim_assets.sampling.samples import Row, Shooter
+from sim_assets.sampling.samples import Row, SampleMaker
 
 SMALL = DataOptions(count=6, instances=1, backend="raycast", points=512, image_size=160)
 
@@ -32,9 +32,9 @@ def _renderer() -> None:
 def rows(category: str, options: DataOptions, views: range | None = None) -> list[Row]:
     request, assets = make_request(category, options)
     with make_renderer("raycast", color=options.color) as renderer:
-        shooter = Shooter(renderer, assets[0].load(), request.settings)
+        maker = SampleMaker(renderer, assets[0].load(), request.settings)
         numbers = views or range(options.count // options.states_per_view)
-        shots = list(shooter.shots([request.key(view) for view in numbers]))
+        shots = list(maker.render_views([request.key(view) for view in numbers]))
     return [row for shot in shots for row in shot.rows]
 
 
