@@ -3,7 +3,7 @@
 
 Asked in this order, the first that names a kind of object that we know wins: an `index.csv` at the
 top of the folder (columns `category`, `id`), PartNet-Mobility's `meta.json`, the bodies that the
-model's semantics name, the robot's name in the URDF, the names of the folders. Kinds that open like
+model's semantics name, the names of the folders, the robot's name in the URDF. Kinds that open like
 one of the nine categories are shown as that category (`KINDS`).
 """
 
@@ -115,9 +115,9 @@ def _said(urdf: Path, root: Path, listed: Mapping[tuple[str, ...], str]) -> Iter
     rows = [line.split(maxsplit=2) for line in _text(urdf.parent / "semantics.txt").splitlines()]
     moving = ("hinge", "slider")
     yield " ".join(row[2] for row in rows if len(row) == 3 and row[1] not in moving)
+    yield " ".join(folders) or root.resolve().name
     named = re.search(r"<robot[^>]*\bname\s*=\s*[\"']([^\"']*)", _text(urdf))
     yield named[1] if named else ""
-    yield " ".join(folders) or root.resolve().name
 
 
 def _index(root: Path) -> dict[tuple[str, ...], str]:
