@@ -189,6 +189,7 @@ def test_objects_that_die_hang_or_fail_cost_themselves_only(tmp_path):
     assert np.unique(split.arrays("instance")["instance"]).tolist() == [0, 4]
     assert {path.name for path in folder.iterdir()} == {
         "card.md",
+        "croissant.json",
         "manifest.json",
         *(shard.file for shard in split.manifest.shards),
     }

@@ -64,11 +64,9 @@ def test_kinds(text: str, category: str | None):
 
 def test_who_says_what_a_model_is(tmp_path: Path):
     """The index before the model, the model before its folder."""
-    cabinet(tmp_path / "drawer/a")
+    cabinet(tmp_path / "drawer/a", ('name="cabinet"', 'name="my_laptop"'))
+    assert found(tmp_path / "drawer") == {"laptop": ["a"]}
     assert found(tmp_path) == {"drawer": ["drawer-a"]}
-    urdf = tmp_path / "drawer/a/cabinet.urdf"
-    urdf.write_text(urdf.read_text().replace('name="cabinet"', 'name="my_laptop"'))
-    assert found(tmp_path) == {"laptop": ["drawer-a"]}
     (tmp_path / "drawer/a/semantics.txt").write_text("body heavy oven_body\ndoor hinge drawer\n")
     assert found(tmp_path) == {"oven": ["drawer-a"]}
     (tmp_path / "drawer/a/meta.json").write_text(json.dumps({"model_cat": "Microwave"}))
@@ -83,9 +81,9 @@ def test_what_belongs_to_no_category_is_named(tmp_path: Path):
     cabinet(tmp_path / "tap/1", ('robot name="cabinet"', 'robot name="tap"'))
     models = real_models(tmp_path)
     assert models.models == {}
-    assert models.others == {"tap-1": f"expected one of {', '.join(KINDS)}, found 'tap', 'tap 1'"}
+    assert models.others == {"tap-1": f"expected one of {', '.join(KINDS)}, found 'tap 1', 'tap'"}
     assert pieces(("val",), models) == pieces(("val",))
-    with pytest.raises(AssetError, match="expected a folder or a .urdf file, found nothing"):
+    with pytest.raises(AssetError, match=r"expected a folder or a \.urdf file, found nothing"):
         real_models(tmp_path / "none")
 
 
