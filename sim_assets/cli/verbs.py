@@ -357,6 +357,34 @@ class View:
         return 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Write a data set in a format that is read without this package.
+
+    OUT gets the same folders, with the manifest, the card and a file for each shard. It appears
+    whole, and replaces only an earlier export.
+    """
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+    format: Literal["webdataset", "parquet", "npz"]
+    """webdataset: tar files with one .npy for each tensor of a sample. parquet: a row for each
+    sample (needs pyarrow: pip install 'scapo[export]'). npz: stacked arrays."""
+    out: Path
+    """Folder to write."""
+
+    def run(self, console: Console) -> int:
+        """Write it, and print what was written."""
+        from sim_assets.describe.info import find_splits
+        from sim_assets.formats.export import export
+
+        for done in export(self.path, find_splits(self.path), self.out, self.format):
+            line = f"{done.name}: {done.samples} samples in {done.files} files"
+            console.print(line, highlight=False, soft_wrap=True)
+        console.print(f"written to {self.out}", highlight=False, soft_wrap=True)
+        return 0
+
+
 VERBS: dict[str, type] = {
     "doctor": Doctor,
     "build": Build,
@@ -367,5 +395,6 @@ VERBS: dict[str, type] = {
     "info": Info,
     "view": View,
     "preview": Preview,
+    "export": Export,
 }
 """In the order of the help."""
