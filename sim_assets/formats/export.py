@@ -20,8 +20,9 @@ import shutil
 import tarfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def _writers(form: ExportFormat) -> tuple[str, Writer]:
     if form == "npz":
         return ".npz", _write_npz
     try:
-        import pyarrow.parquet  # noqa: F401 - an extra, which only this format needs
+        import_module("pyarrow.parquet")  # an extra, which only this format needs
     except ImportError as error:
         raise ValueError(
             "format parquet: expected pyarrow, found none (pip install 'scapo[export]')"
@@ -154,10 +155,7 @@ def _add(file: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def _write_parquet(path: Path, arrays: Arrays, keys: Keys, manifest: Manifest) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    library = cast("Any", pa)  # its own types are partly unknown
+    library = import_module("pyarrow")
     columns: dict[str, Any] = {
         "key": library.array(keys.key),
         "index": library.array(keys.index, library.int64()),
@@ -176,7 +174,7 @@ def _write_parquet(path: Path, arrays: Arrays, keys: Keys, manifest: Manifest) -
         "shapes": {name: list(array.shape[1:]) for name, array in sorted(arrays.items())},
     }
     table = library.table(columns).replace_schema_metadata({"scapo": json.dumps(told)})
-    cast("Any", pq).write_table(table, path, compression="zstd")
+    import_module("pyarrow.parquet").write_table(table, path, compression="zstd")
 
 
 _READ: dict[str, str] = {

@@ -49,7 +49,7 @@ def stored(folder: Path) -> dict[str, np.ndarray]:
     """The tensors of a split, by safetensors alone."""
     files: list[dict[str, np.ndarray]] = []
     for path in sorted(folder.glob("*.safetensors")):
-        with safe_open(path, "numpy") as file:  # pyright: ignore[reportGeneralTypeIssues]
+        with safe_open(path, "numpy") as file:
             files.append({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
     return {name: np.concatenate([file[name] for file in files]) for name in files[0]}
 
@@ -60,7 +60,7 @@ def read_npz(folder: Path) -> dict[str, np.ndarray]:
 
 
 def read_webdataset(folder: Path) -> dict[str, np.ndarray]:
-    """Grouped as WebDataset does: a sample is a run of members with one name up to the first dot."""
+    """Grouped as WebDataset does: a sample is a run of members alike up to the first dot."""
     samples: list[dict[str, Any]] = []
     for path in sorted(folder.glob("*.tar")):
         with tarfile.open(path) as file:
@@ -87,12 +87,9 @@ def read_parquet(folder: Path) -> dict[str, np.ndarray]:
     for path in sorted(folder.glob("*.parquet")):
         shapes = json.loads(pq.read_schema(path).metadata[b"scapo"])["shapes"]
         rows = pd.read_parquet(path)
-        tables.append(
-            {
-                name: np.stack(rows[name].to_list()).reshape(-1, *shapes.get(name, ()))
-                for name in rows
-            }
-        )
+        values = {name: rows[name].to_numpy() for name in rows}
+        nested = {name: np.stack(values[name]).reshape(-1, *s) for name, s in shapes.items() if s}
+        tables.append({**values, **nested})
     return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
 
 
@@ -179,9 +176,7 @@ def test_damaged_data_leave_nothing(data: Path, tmp_path: Path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
-def test_without_pyarrow_parquet_says_what_is_missing(
-    data: Path, tmp_path: Path, monkeypatch, capsys
-):
+def test_parquet_says_that_pyarrow_is_missing(data: Path, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     assert run("export", data, "--format", "parquet", "--out", tmp_path / "out") == 1
     assert "expected pyarrow, found none (pip install 'scapo[export]')" in capsys.readouterr().err
