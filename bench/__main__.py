@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Annotated, Any, Union
 
 import tyro
@@ -20,7 +21,10 @@ from rich.logging import RichHandler
 from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
 
-DESCRIPTION = "Train, predict, score and tabulate methods of articulated pose estimation."
+DESCRIPTION = (
+    "Train, predict, score and tabulate methods of articulated pose estimation "
+    "(--version: of which release)."
+)
 
 
 def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 - made at run time
@@ -34,6 +38,9 @@ def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and end the process."""
     words, preset = prepare(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        say(Console(), f"scapo-bench {version('scapo')}")
+        sys.exit(0)
     command: Any = tyro.cli(
         _commands(words[:1], preset),
         prog="scapo-bench",

@@ -68,7 +68,7 @@ class Request:
     calibration: Path | None = None
     """Predictions of the same run on the training split, to fit the frames of a method that saw
     no poses. Without it poses are compared as given."""
-    settings: tyro.conf.Fixed[Settings] = field(default_factory=Settings)
+    settings: tyro.conf.Suppress[tyro.conf.Fixed[Settings]] = field(default_factory=Settings)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,6 +182,9 @@ class TrainRequest(Generic[M]):
     """Run folder."""
     split: str = "train"
     """Split to train on."""
+    val_split: str = "val"
+    """Split on which methods with a validation pass are validated; where the data lack it, every
+    tenth object of --split is held out for that. Others do not read it."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, cuda:1, ..."""
     seed: int = 1

@@ -26,18 +26,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from scapo.categories import CATEGORIES, category
+    from scapo.categories import CATEGORIES, Category, JointSpec, category
     from scapo.predictor import load
-    from scapo.types import (
-        Category,
-        Joints,
-        JointSpec,
-        Labels,
-        Observation,
-        Prediction,
-        Sample,
-        SampleKey,
-    )
+    from scapo.types import Joints, Labels, Observation, Prediction, Sample, SampleKey
 
 __all__ = [
     "CATEGORIES",
@@ -53,7 +44,13 @@ __all__ = [
     "load",
 ]
 
-_HOMES = {"CATEGORIES": "categories", "category": "categories", "load": "predictor"}
+_HOMES = {
+    "CATEGORIES": "categories",
+    "Category": "categories",
+    "JointSpec": "categories",
+    "category": "categories",
+    "load": "predictor",
+}
 """Where a name comes from; the others from `types`."""
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from scapo.types import Category
+from scapo.categories import Category
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -33,7 +33,7 @@ FACTORS = {
 def factors(truth: Truth, manifest: Manifest) -> dict[str, Float[np.ndarray, " B"]]:
     """The value of every factor for some samples.
 
-    Azimuth and elevation are those of the camera about the object's origin (`types.Window`).
+    Azimuth and elevation are those of the camera about the object's origin (`categories.Window`).
     """
     upper = np.array([max(joint.upper, 1e-12) for joint in manifest.joints])
     pose = truth.camera_T_part[:, 0]

@@ -30,8 +30,8 @@ Item = TypeVar("Item")
 
 
 def say(console: Console, line: object) -> None:
-    """One line, however long, without markup."""
-    console.print(one_line(line), markup=False, highlight=False, soft_wrap=True)
+    """One line, however long, without markup and emoji."""
+    console.print(Text(one_line(line)), soft_wrap=True)
 
 
 def watched(console: Console, what: str) -> Callable[[Sequence[Item]], Iterable[Item]]:

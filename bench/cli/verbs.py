@@ -183,11 +183,11 @@ VERBS: dict[str, Any] = {
 
 def train_verb(preset: str | None) -> Any:  # noqa: ANN401 - a type made at run time
     """`Train` over all methods, their flags defaulting to the preset of that name."""
-    from bench.methods import METHODS
+    from bench.methods import all_methods
 
     methods = [
         Annotated[entry.kind, tyro.conf.subcommand(name, default=entry.preset(preset))]
-        for name, entry in METHODS.items()
+        for name, entry in all_methods().items()
     ]
     return Train[Union[tuple(methods)]]  # noqa: UP007 - the tuple is not known to the type checker
 

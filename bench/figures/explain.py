@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from matplotlib.figure import Figure
 from bench.analysis.explain import Ladder, ladder_csv, measure, strata_csv
 from bench.analysis.ladder import PIECES, Rung, ladder_markdown
 from bench.analysis.strata import FACTORS, Stratum
+from bench.figures.drawing import plain, to_png
 from bench.requests import Request
 from bench.statistics import Interval
 from scapo.store import write_bytes
@@ -113,10 +113,8 @@ def _bars(
 
 
 def _png(figure: Figure, title: str) -> bytes:
-    figure.suptitle(title)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
+    figure.suptitle(plain(title))
+    return to_png(figure, dpi=110)
 
 
 def explain(request: Request) -> list[Path]:

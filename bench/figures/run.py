@@ -14,11 +14,10 @@ from bench.figures.pictures import ranking_picture, training_curve
 from bench.figures.template import template_picture, template_shape
 from bench.methods import load
 from bench.requests import PicturesRequest, Request
+from bench.run_files import METRICS
 from scapo.method import AbstractMethod, evenly
 from scapo.store import StoreError
 from scapo.store.files import Header
-
-CURVE = "metrics.jsonl"
 
 
 def draw_pictures(request: PicturesRequest) -> Iterator[str]:
@@ -59,7 +58,7 @@ def _figures(
         "overlay.png": "left out, the predictions hold no poses",
         "template.png": f"left out, {method.name} has no template or says no joint states",
         "ranking.png": lambda path: ranking_picture(answered, request.predictions, path),
-        "training.png": f"left out, no {CURVE} beside the checkpoint",
+        "training.png": f"left out, no {METRICS} beside the checkpoint",
     }
     if posed:
         out["overlay.png"] = lambda path: overlay_picture(answered, path, samples)
@@ -67,8 +66,8 @@ def _figures(
         out["template.png"] = lambda path: template_picture(
             answered, shape, request.predictions, path
         )
-    if (run / CURVE).is_file():
-        out["training.png"] = lambda path: training_curve(run / CURVE, path)
+    if (run / METRICS).is_file():
+        out["training.png"] = lambda path: training_curve(run / METRICS, path)
     return out
 
 

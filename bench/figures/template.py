@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a method believes the category to be: its template with parts and joints, opening.
 
-The template of a trained method: its points, parts and joints, and how its joints move it.
+First the template of a trained method and how its joints move it, then the picture of that.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from bench.figures.drawing import (
     draw_points,
     look,
     part_legend,
+    plain,
+    save,
     transform,
     window,
 )
-from bench.figures.pictures import save
 from scapo.geometry import rigid as geometry
 from scapo.method import AbstractMethod
 from scapo.paper.method import Scapo
@@ -153,7 +154,8 @@ def template_picture(
         axes.set_title(f"{name}: {_state_text(value, turns)}", fontsize=9, pad=2)
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.05, top=0.9, wspace=0, hspace=0)
     words = f"{answered.header.method} {answered.header.variant}".strip()
-    figure.suptitle(f"{words}: the template of {answered.header.category}", fontsize=10, y=0.985)
+    title = f"{words}: the template of {answered.header.category}"
+    figure.suptitle(plain(title), fontsize=10, y=0.985)
     part_legend(figure, answered.split.manifest.parts, 0.025)
     save(figure, out)
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -15,14 +14,16 @@ from jaxtyping import Int
 
 from bench.methods import load
 from bench.requests import PredictRequest
+from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
 from bench.scoring.predictions import Header, write_predictions
 from scapo.method import AbstractMethod, OracleMethod, evenly
+from scapo.records import map_tensors
 from scapo.store import open_split
+from scapo.store.checkpoint import require_fields
 from scapo.store.files import Arrays
-from scapo.store.samples import SampleDataset, label, map_labels, observe
-from scapo.training.run_folder import TIMING
-from scapo.types import Observation, Prediction
+from scapo.store.samples import SampleDataset, label, observe, observed
+from scapo.types import Prediction
 
 RUN_FIELDS = ("commit", "config", "data_digest", "machine", "seed", "training")
 """Of the checkpoint's header, handed on to scores and tables."""
@@ -47,11 +48,12 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         StoreError: No checkpoint, or no such data.
     """
     method, header = load(request.checkpoint)
+    require_fields(header, ("seed", "steps"), request.checkpoint)
     device = pick_device(request.device)
     method.to(device)
     oracle = _oracle_words(method) if request.oracle else []
     split = open_split(request.data, header["category"], request.split)
-    samples = SampleDataset(split)
+    samples = SampleDataset(split, observed(split))
     chosen = evenly(len(samples), request.limit or len(samples))
     started = time.perf_counter()
     batches = watch(chosen.split(request.batch))
@@ -101,11 +103,10 @@ def _answer(
     device: str,
 ) -> Arrays:
     """The tensors of a predictions file for the samples of `index`."""
-    batch = samples.batch(index)
-    observation = Observation(points=observe(batch).points.to(device))
+    batch = map_tensors(samples.batch(index), lambda tensor: tensor.to(device))
+    observation = observe(batch)
     if request.oracle and isinstance(method, OracleMethod):
-        labels = map_labels(label(batch).keep(method.oracle), lambda tensor: tensor.to(device))
-        return to_arrays(method.predict_given(observation, labels))
+        return to_arrays(method.predict_given(observation, label(batch).keep(method.oracle)))
     return to_arrays(method.predict(observation, request.mode))
 
 
@@ -123,10 +124,10 @@ def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -
 
 def timing(run: Path) -> dict[str, Any]:
     """Seconds of training, where the run folder is at hand."""
-    path = (run if run.is_dir() else run.parent) / TIMING
-    if not path.is_file():
+    folder = run if run.is_dir() else run.parent
+    if not (folder / TIMING).is_file():
         return {}
-    return {"training_seconds": round(json.loads(path.read_text())["seconds"], 1)}
+    return {"training_seconds": round(read_timing(folder).seconds, 1)}
 
 
 def to_arrays(prediction: Prediction) -> Arrays:

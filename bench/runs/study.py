@@ -8,6 +8,7 @@ there and newer than its run stays, so a study that was interrupted goes on.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +29,9 @@ from bench.runs.stability import measure_stability
 from bench.scoring.evaluate import evaluate
 from scapo.store import StoreError
 from scapo.store.checkpoint import WEIGHTS
+
+LONGEST_NAME = 150
+"""Characters of a run's name in names of files, which may have 255 bytes."""
 
 
 def study(request: StudyRequest, say: Callable[[str], None], watch: Watch = iter) -> Path:
@@ -74,8 +78,8 @@ def _name(run: Path) -> tuple[str, bool]:
     """A run's name in files, and whether its frames must be fitted."""
     method, header = load(run)
     words = [header["category"], method.name, method.variant, f"seed{header['seed']}"]
-    name = "-".join(word.replace(" ", "_") for word in words if word)
-    return name, "pose" not in method.supervision
+    name = "-".join(re.sub(r"[^\w.,=+@-]", "_", word) for word in words if word)
+    return name[:LONGEST_NAME], "pose" not in method.supervision
 
 
 def _weights(run: Path) -> Path:

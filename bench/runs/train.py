@@ -5,22 +5,25 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from bench.methods import METHODS
+from bench.methods import all_methods
 from bench.requests import TrainRequest
+from bench.run_files import TIMING
 from bench.runs.report import REPORT, write_report
 from scapo.categories import category
 from scapo.store import open_split
 from scapo.store.checkpoint import WEIGHTS
-from scapo.store.samples import read_training_data
+from scapo.store.samples import TrainingData, read_training_data
+from scapo.store.schema import StoreError
 from scapo.training import fit
 from scapo.training.distributed import joined, own_device
 from scapo.training.precision import Arithmetic
-from scapo.training.run_folder import TIMING, kept
+from scapo.training.run_folder import kept
 
 
 def train(
@@ -60,11 +63,14 @@ def _fit(
     listener: fit.Listener,
 ) -> None:
     """Read the split, build the method and fit it."""
-    name = next(name for name, entry in METHODS.items() if isinstance(request.method, entry.kind))
+    methods, config_type = all_methods(), type(request.method)
+    name = next(name for name, entry in methods.items() if entry.kind is config_type)
     kind = category(request.category)
     split = open_split(request.data, request.category, request.split)
     generator = torch.Generator().manual_seed(request.seed)
-    method = METHODS[name].build(request.method, kind, generator)
+    method = methods[name].build(request.method, kind, generator)
+    if method.name != name:
+        raise ValueError(f"{name}: expected a method of that name, found {method.name}")
     precision = Arithmetic(precision=request.precision, compiled=request.compile, tf32=request.tf32)
     config = fit.FitConfig(
         seed=request.seed,
@@ -81,9 +87,20 @@ def _fit(
             f"device {config.device}"
         )
     data = read_training_data(split)
+    if any(stage.validate_every for stage in method.stages()):
+        data = replace(data, validation=_validation(request))
     logging.getLogger("scapo").setLevel(logging.WARNING if say is None else logging.INFO)
     shown = fit.silent if say is None else listener
     fit.fit(method, data, request.out, config, resume=request.resume, listener=shown)
+
+
+def _validation(request: TrainRequest[Any]) -> TrainingData | None:
+    """The split for validation, where the data have it."""
+    try:
+        split = open_split(request.data, request.category, request.val_split)
+    except StoreError:
+        return None
+    return read_training_data(split)
 
 
 def pick_device(name: str) -> str:

@@ -19,7 +19,7 @@ from bench.requests import Request, Settings
 from bench.scoring.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.scoring.compat_files import Canon, check_record, fit_canon, score_compat
 from bench.scoring.predictions import Header, Predictions, read_prediction_header
-from bench.scoring.score_files import Run, side_file, write_report, write_rows, writing
+from bench.scoring.score_files import Run, side_file, writing
 from bench.scoring.scores import Errors, Frames, Rows, score
 from bench.scoring.summary import summarise
 from bench.scoring.truth import Truth, blocks, revolute, symmetry
@@ -132,16 +132,15 @@ def evaluate(request: Request) -> dict[str, Any]:
         fitted = fit_frames(request, header, split, predictions)
         scored = _Scored()
         run = run_of(request, header, split)
-        with writing(request.out) as stream:
+        with writing(request.out) as file:
             for truth in blocks(split):
                 rows = predictions.rows(truth.first, len(truth))
                 errors = _errors(request.settings, fitted, truth, rows)
-                write_rows(stream, run, truth.first, errors)
+                file.add(run, truth.first, errors)
                 scored.add(truth, errors)
             predictions.finish()
-            report = _report(request, header, split, fitted, scored, predictions)
-    write_report(side_file(request.out), report)
-    return report
+            file.report = _report(request, header, split, fitted, scored, predictions)
+    return file.report
 
 
 class _Scored:

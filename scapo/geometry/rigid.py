@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.types import JointKind
+from scapo.categories import JointKind
 
 
 def rigid(

@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from scapo.categories import Category, JointKind
 from scapo.geometry.numerics import at_least_float32
 from scapo.paper.vector_neurons import uniform
-from scapo.types import Category, JointKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

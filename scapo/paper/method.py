@@ -21,7 +21,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.drawing import PictureData
+from scapo.categories import Category, JointKind
+from scapo.pictures import PictureData
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
@@ -42,7 +43,7 @@ from scapo.paper.objectives import Explanation, LossConfig, articulation, canoni
 from scapo.paper.refine import refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
-from scapo.types import Category, JointKind, Joints, Labels, Observation, Prediction
+from scapo.types import Joints, Labels, Observation, Prediction
 
 
 def opalign_record(e: Explanation) -> dict[str, Tensor]:
@@ -137,6 +138,7 @@ class Scapo(AbstractMethod):
         self.config = config
         self.category = category
         self.supervision = frozenset(config.supervision)
+        self.least_points = config.encoder.neighbours
         self.kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         parts, code = len(category.parts), config.encoder.code
         with torch.random.fork_rng(devices=[]):  # layers draw before `initialise` draws again

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, random_rotations
 from scapo.paper import losses
 from scapo.paper.augment import DISTURBANCES, Disturbance, disturb
@@ -25,7 +26,6 @@ from scapo.paper.skinning import (
     part_maps,
     to_canonical,
 )
-from scapo.types import JointKind
 
 AblatedTerm = Literal["shape_var", "dir_align", "joint_prox", "joint_boundary"]
 

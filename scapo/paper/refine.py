@@ -16,11 +16,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.geometry.points import squared_distances
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation
 from scapo.paper.skinning import cross_maps, deform, part_maps
-from scapo.types import JointKind
 
 SHARPNESS = (30.0, 120.0)
 """Of the robust distances, cloud to template and back (OP-Align's)."""

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, joint_motion, mean_rotation, rigid, rotation_between
 from scapo.paper.heads import JointPairs
-from scapo.types import JointKind
 
 
 class Bones(nn.Module):

@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.method import evenly
 from scapo.registered.axis_deviation import leaning_templates, settle_leans
 from scapo.registered.bundle_adjustment import FitOptions, fit
@@ -34,7 +35,6 @@ from scapo.registered.pairwise import rotation_grid
 from scapo.registered.pose_search import Finalists, Found, SearchSpace, search, settle_states
 from scapo.registered.template import ArticulatedTemplate
 from scapo.registered.views import Views
-from scapo.types import JointKind
 
 
 @torch.no_grad()

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.drawing import Panel, PictureData
+from scapo.pictures import Panel, PictureData
 from scapo.registered.joint_limits import StateRange
 from scapo.registered.template import ArticulatedTemplate, Placement
 

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.registered.bundle_adjustment import FitOptions, fit
 from scapo.registered.gauge import choose_axes
 from scapo.registered.joint_limits import RANGE_COST
@@ -30,7 +31,6 @@ from scapo.registered.pairwise import register_pairs, rotation_grid
 from scapo.registered.synchronisation import agree
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.views import Views
-from scapo.types import JointKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.registered.template import Placement
-from scapo.types import JointKind
 
 RANGE_COST = 0.03
 """Mean loss that a radian of range may save; a sliding joint pays it per mean radius (0.25)."""

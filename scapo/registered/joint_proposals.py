@@ -18,12 +18,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import project_rotation
 from scapo.registered.motion_segmentation import gather_evidence, spread
 from scapo.registered.pairwise import HIDDEN_COST, NORMAL_WEIGHT, NearestGrid, rotation_grid
 from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement
 from scapo.registered.views import Views, free_and_hidden
-from scapo.types import JointKind
 
 TOLD = 0.05
 """Share of the base's normals that a direction needs to be one of its main ones."""

@@ -26,7 +26,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from scapo.drawing import PictureData
+from scapo.categories import Category, JointKind
+from scapo.pictures import PictureData
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.registered.axis_deviation import settle_leans
@@ -61,7 +62,7 @@ from scapo.registered.template import (
     turn_placement,
 )
 from scapo.registered.views import Views, observe
-from scapo.types import Category, JointKind, Labels, Observation, Prediction, Supervision
+from scapo.types import Labels, Observation, Prediction, Supervision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +106,7 @@ class RegisteredScapo(AbstractMethod):
 
     name: ClassVar[str] = "registered"
     networks: ClassVar[tuple[str, ...]] = ("network",)
+    least_points = 16
     supervision: frozenset[Supervision] = frozenset()
 
     def __init__(
@@ -189,7 +191,7 @@ class RegisteredScapo(AbstractMethod):
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`vote_losses`)."""
         del labels
-        row = self.pseudo.find(observation.points[:, 0])
+        row = self._learned_row(step)
         points, _ = normalise(replaced(observation.points, self.pseudo.belonging[row]))
         device = points.device
         index = torch.randperm(points.shape[1], generator=step.generator, device=device)
@@ -198,6 +200,18 @@ class RegisteredScapo(AbstractMethod):
         noise = torch.randn(points.shape, generator=step.generator, device=device) * 0.003
         votes = self.network((points + noise) @ frame.mT)
         return vote_losses(votes, self._target(points, row))
+
+    def _learned_row(self, step: Step) -> Int[Tensor, " B"]:
+        """Which of the learned clouds a batch holds.
+
+        Raises:
+            ValueError: A cloud whose placement was not searched for.
+        """
+        learned = evenly(step.total, self.config.learned).to(step.index.device)
+        row = torch.searchsorted(learned, step.index).clamp(max=len(learned) - 1)
+        if bool((learned[row] != step.index).any()):
+            raise ValueError("expected clouds whose placements were found, found others")
+        return row
 
     def _thinned(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B K 3"]:
         """`config.points` of each cloud by farthest-point sampling, or all."""

@@ -6,16 +6,16 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.registered.template import Placement
 
 
 class PseudoPlacements(nn.Module):
-    """Placements of training clouds as found, looked up by a cloud's first point."""
+    """Placements of training clouds as found, in the order of those clouds."""
 
     key: Tensor
+    """Each cloud's first point."""
     rotation: Tensor
     translation: Tensor
     log_scale: Tensor
@@ -64,17 +64,6 @@ class PseudoPlacements(nn.Module):
         names = self.NAMES[1:6]
         values = {name: getattr(self, name) for name in names}
         return Placement(**values, lean=torch.zeros_like(self.shift))
-
-    def find(self, first: Float[Tensor, "B 3"]) -> Int[Tensor, " B"]:
-        """Row of each cloud, by its first point.
-
-        Raises:
-            ValueError: A cloud that is not there.
-        """
-        gap = (first[:, None] - self.key).abs().sum(-1)
-        if bool((gap.amin(1) > 0).any()):
-            raise ValueError("expected clouds whose placements were found, found others")
-        return gap.argmin(1)
 
     def _load_from_state_dict(
         self,

@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from scapo.types import JointKind
+from scapo.categories import JointKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

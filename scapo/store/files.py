@@ -163,6 +163,19 @@ def read(
     return arrays, header
 
 
+def tensor_names(path: Path) -> set[str]:
+    """The names of a file's tensors.
+
+    Raises:
+        StoreError: No such file, or not safetensors.
+    """
+    try:
+        with _open(path) as file:
+            return set(file.keys())
+    except (SafetensorError, OSError) as error:
+        raise StoreError(f"{path}: expected a safetensors file, found {error}") from error
+
+
 def require(path: Path, names: Iterable[str], there: Iterable[str]) -> None:
     """Refuse a file without one of the tensors `names`.
 

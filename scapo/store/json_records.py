@@ -13,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
+from scapo.store.regular import read_regular
+
 T = TypeVar("T")
 
 
@@ -27,7 +29,7 @@ def read_json(path: Path, error: type[StoreError] = StoreError) -> Any:  # noqa:
         StoreError: It cannot be read, or is not JSON.
     """
     try:
-        return parse_json(path.read_bytes())
+        return parse_json(read_regular(path))
     except (OSError, ValueError, RecursionError) as problem:
         raise error(f"{path}: expected JSON, found {problem}") from problem
 

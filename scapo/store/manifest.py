@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from scapo.categories import JointSpec
 from scapo.geometry.matrices import rotation_error
 from scapo.store.json_records import StoreError, from_json, read_json
-from scapo.types import JointSpec
 
 FORMAT = "scapo-manifest/1"
 

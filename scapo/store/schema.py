@@ -32,8 +32,10 @@ LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "visible": ("float32", ("P",)),
     "camera": ("float32", (6,)),
     "instance": ("int32", ()),
+    "sensor": ("float32", (3,)),
 }
-"""dtype and shape of one sample's tensors; on disk the samples of a shard are stacked."""
+"""dtype and shape of one sample's tensors; on disk the samples of a shard are stacked. `color` is
+optional, and so is `sensor`: the camera's centre in metres where clouds are not in its frame."""
 
 
 @runtime_checkable

@@ -51,6 +51,7 @@ class Split:
             arrays, header = read(path, SAMPLES, names)
             self.check_header(path, header)
             check_samples(path, arrays, self.manifest, shard.first, shard.count)
+            check_bytes(path, shard.sha256)
             yield arrays
 
     def arrays(self, *names: str) -> Arrays:
@@ -91,9 +92,32 @@ class Split:
             path = self.folder / shard.file
             if not path.is_file():
                 raise StoreError(f"{path}: expected a shard of the manifest, found none")
-            found = sha256_file(path)
-            if found != shard.sha256:
-                raise StoreError(f"{path}: expected sha256 {shard.sha256}, found {found}")
+            check_bytes(path, shard.sha256, again=True)
+
+
+_CHECKED: set[tuple[Path, str, int, int]] = set()
+"""Path, SHA-256, length and time of change of the shards that this process has compared."""
+
+
+def check_bytes(path: Path, sha256: str, *, again: bool = False) -> None:
+    """Compare a shard's bytes with the manifest, once in a process unless the file was changed.
+
+    Args:
+        path: Of the shard.
+        sha256: By the manifest.
+        again: Also where it was compared before.
+
+    Raises:
+        StoreError: They differ.
+    """
+    state = path.stat()
+    key = (path.absolute(), sha256, state.st_size, state.st_mtime_ns)
+    if key in _CHECKED and not again:
+        return
+    found = sha256_file(path)
+    if found != sha256:
+        raise StoreError(f"{path}: expected sha256 {sha256}, found {found}")
+    _CHECKED.add(key)
 
 
 def find_split(folder: Path | str, category: str | None, split: str) -> Path:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from scapo.types import Category
+from scapo.categories import Category
 from sim_assets.models.validate import AssetError, refuse
 
 OPENCV_T_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

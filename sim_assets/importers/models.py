@@ -17,9 +17,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, Category
 from scapo.export.urdf import Joint, Link, Surface
-from scapo.types import Category
 from sim_assets.importers.records import Mesh, Vector
 from sim_assets.models.joints import hull_area, hull_points, moved
 from sim_assets.models.validate import refuse

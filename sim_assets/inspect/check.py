@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from scapo.categories import JointKind, JointSpec
 from scapo.parallel.pool import Outcome, Pool, Report
 from scapo.store.files import write_bytes
-from scapo.types import JointKind, JointSpec
 from sim_assets.generation.request import make_request
 from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.joints import Candidate, candidates

@@ -37,7 +37,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-from scapo.types import Category, JointSpec
+from scapo.categories import Category, JointSpec
 from sim_assets.models.robot import Joint, Robot
 from sim_assets.models.sources import Traits
 from sim_assets.models.validate import AssetError, check_movable, kinds, refuse

@@ -19,8 +19,8 @@ import trimesh
 from jaxtyping import Float
 from trimesh.visual import TextureVisuals
 
+from scapo.categories import Category
 from scapo.categories import category as find_category
-from scapo.types import Category
 from sim_assets.models import frames
 from sim_assets.models.account import account
 from sim_assets.models.frames import Vector

@@ -25,8 +25,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from scapo.categories import Window
 from scapo.geometry.camera import Intrinsics
-from scapo.types import Window
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import PresetName, Protocol
 from sim_assets.sampling import presets

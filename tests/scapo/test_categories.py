@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scapo.categories import CATEGORIES, category
-from scapo.types import Category
+from scapo.categories import CATEGORIES, Category, category
 
 # name: parts, kinds of the joints, benchmark sets, diagonal of the symmetry
 TABLE = {

@@ -192,7 +192,7 @@ def test_references_bracket_a_method(split, tmp_path):
         (scores[kind],) = read_scores(tmp_path / f"{kind}.csv.gz")
     for found in scores.values():
         assert all(np.isfinite(v).all() for v in found.errors.values())
-        assert found.report["supervision"] == ["joint", "pose", "segmentation"]
+        assert found.report.supervision == ("joint", "pose", "segmentation")
     oracle, constant = (scores[k].errors for k in ("oracle-pose", "constant"))
     assert oracle["iou", "1"].mean() > constant["iou", "1"].mean()
     if split.manifest.joints[0].kind == "prismatic":  # no swap: the true base pose, exactly

@@ -265,19 +265,6 @@ def test_names_cannot_break_latex():
     assert escape("é") == "?"
 
 
-def test_without_the_json_the_numbers_are_the_same(scores, tmp_path):
-    folder, kept = scores
-    for path in folder.glob("clean-laptop-icp-*"):
-        shutil.copy(path, tmp_path)
-    for path in tmp_path.glob("*.json"):
-        path.unlink()
-    table = tables.build(load(tmp_path))[0]
-    row = one(table, block=table.blocks[3].heading, method="ICP", source="ours", column="Laptop")
-    assert float(row["value"]) == pytest.approx(kept["icp"]["part_rotation", "deg"].mean())
-    assert row["pose"] == ""  # its supervision is not known, so it is not ranked
-    assert row["best"] == "0"
-
-
 def test_the_commands(scores, tmp_path, capsys):
     folder, _ = scores
     program.main(["tables", "--scores", str(folder), "--out", str(tmp_path), "--ap-rule", "min"])

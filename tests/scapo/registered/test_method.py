@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -17,6 +19,11 @@ from scapo.registered.method import RegisteredConfig, RegisteredScapo
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
+
+
+def at(progress: float, index: Tensor, g: torch.Generator) -> Step:
+    """Where a batch of these clouds is, of twelve in all."""
+    return Step(stage="votes", progress=progress, generator=g, index=index, total=12)
 
 
 def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
@@ -34,9 +41,7 @@ def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
     optimiser = torch.optim.Adam(method.network.parameters(), 3e-3)
     g = generator(1)
     for step in range(steps):
-        terms = method.losses(
-            observation, Labels(), Step(stage="votes", progress=step / steps, generator=g)
-        )
+        terms = method.losses(observation, Labels(), at(step / steps, torch.arange(12), g))
         optimiser.zero_grad()
         torch.stack(list(terms.values())).sum().backward()
         optimiser.step()
@@ -126,3 +131,25 @@ def test_pictures_show_the_template_on_the_clouds():
     assert first.beneath is not None
     gap = squared_distances(first.beneath[None], first.points[None]).sqrt()
     assert gap.median() < 0.2
+
+
+def test_a_batch_is_told_by_its_samples_alone():
+    method, observation = trained(0)
+    some = torch.tensor([7, 2])
+    points = observation.points[some].clone()
+    points[:, 0] = points[0, 1]  # clouds that begin with the same point
+    batch = Observation(points=points)
+    own = method.losses(batch, Labels(), at(0.0, some, generator(3)))
+    other = method.losses(batch, Labels(), at(0.0, some.flip(0), generator(3)))
+    assert (other["votes"] - own["votes"]).abs() > 1e-3
+
+
+def test_of_many_clouds_only_the_learned_ones_have_placements():
+    method, observation = trained(0)
+    few = RegisteredScapo(replace(method.config, learned=3), method.category, generator(0))
+    few.load_state_dict(method.state_dict())  # of 12 clouds, 0, 5 and 11 are learned
+    row = torch.tensor([11, 0])
+    batch = Observation(points=observation.points[row])
+    assert few._learned_row(at(0.0, row, generator(0))).tolist() == [2, 0]
+    with pytest.raises(ValueError, match="expected clouds whose placements were found"):
+        few.losses(batch, Labels(), at(0.0, row - 1, generator(0)))

@@ -9,11 +9,11 @@ import pytest
 import roma
 import torch
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import random_rotations, rotation_angle
 from scapo.registered.bundle_adjustment import view_loss
 from scapo.registered.pose_refinement import StepOptions, _move, _place, settle
 from scapo.registered.template import ArticulatedTemplate, Placement
-from scapo.types import JointKind
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 

@@ -10,9 +10,9 @@ import roma
 import torch
 from torch.testing import assert_close
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, joint_motion, random_rotations, rigid
 from scapo.registered.template import ArticulatedTemplate, Placement, interleave, turn_placement
-from scapo.types import JointKind
 from tests.helpers.strategies import generator
 
 

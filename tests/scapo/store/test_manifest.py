@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from scapo.categories import JointSpec
 from scapo.store.manifest import (
     Instance,
     Manifest,
@@ -17,7 +18,6 @@ from scapo.store.manifest import (
     read_manifest,
     shards_digest,
 )
-from scapo.types import JointSpec
 from tests.helpers.splits import edit_manifest, instance, write_split
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 
 from scapo.store import open_split
-from scapo.store.samples import map_labels, read_training_data
-from scapo.types import Labels
+from scapo.store.samples import read_training_data
 from tests.helpers.splits import write_split
 from tests.helpers.tiny import tiny_data
 
@@ -34,7 +33,3 @@ def test_batches_follow_the_index() -> None:
     assert labels.part is not None
     assert data.labels.part is not None
     assert torch.equal(labels.part, data.labels.part[index])
-
-
-def test_withheld_labels_stay_withheld() -> None:
-    assert map_labels(Labels(), lambda tensor: tensor + 1) == Labels()

@@ -35,6 +35,7 @@ def test_the_layout_is_that_of_the_contract(manifest: Manifest) -> None:
         "visible": "float32",
         "camera": "float32",
         "instance": "int32",
+        "sensor": "float32",
     }
     assert sample_shapes(manifest, 5) == {
         "points": (5, POINTS, 3),
@@ -47,6 +48,7 @@ def test_the_layout_is_that_of_the_contract(manifest: Manifest) -> None:
         "visible": (5, 3),
         "camera": (5, 6),
         "instance": (5,),
+        "sensor": (5, 3),
     }
 
 
@@ -110,6 +112,7 @@ def test_impossible_values_are_refused(
 def test_other_types_and_shapes_are_refused(manifest: Manifest, name: str) -> None:
     arrays = sample_arrays("eyeglasses", 4, 0)
     arrays["color"] = np.zeros((4, POINTS, 3), np.uint8)
+    arrays["sensor"] = np.zeros((4, 3), np.float32)
     good = arrays[name]
     for bad in (good.astype(np.float64), good.astype(np.int64)):
         message = f"tensor '{name}': expected dtype {good.dtype}, found {bad.dtype}"

@@ -13,7 +13,8 @@ pytest.importorskip("matplotlib")
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from scapo.drawing import OBLIQUE, PART_COLORS, Panel, PictureData, render
+from scapo.drawing import PART_COLORS
+from scapo.pictures import OBLIQUE, Panel, PictureData, render
 
 
 def square(side: float) -> torch.Tensor:
@@ -78,3 +79,9 @@ def test_the_oblique_view_is_a_rotation() -> None:
 
 def test_nothing_to_show_is_no_error() -> None:
     assert render(PictureData(panels=()))[0].startswith(b"\x89PNG")
+
+
+def test_captions_are_not_parsed() -> None:
+    panel = Panel(points=square(1.0), title=r"$\frac{$")
+    png, _ = render(PictureData(panels=(panel,), caption="$\\frac{$ [/x] a_b", view="camera"))
+    assert png.startswith(b"\x89PNG")
