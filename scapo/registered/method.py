@@ -27,9 +27,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
-from scapo.pictures import PictureData
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
+from scapo.pictures import PictureData
 from scapo.registered.axis_deviation import settle_leans
 from scapo.registered.decode import nearest_weights, placed_prediction
 from scapo.registered.discovery import discover, search_all, trust_order

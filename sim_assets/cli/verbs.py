@@ -289,18 +289,25 @@ class Generate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Info:
-    """Say what a data set holds, and whether its shards are whole."""
+    """Say what a data set holds, how much its objects differ, and whether its shards are whole."""
 
     path: tyro.conf.Positional[Path]
     """A data set, or a category or split of one."""
+    source: Path | None = None
+    """Folder of the models that it was made from, to measure them too."""
 
     def run(self, console: Console) -> int:
         """Print counts, histograms and digests of every split; 1 if a shard is damaged."""
-        from sim_assets.describe.info import describe_folder
+        from scapo.store import Split
+        from sim_assets.describe.info import describe_split, find_splits
+        from sim_assets.inspect.variation import Variation
 
-        whole = True
-        for report in describe_folder(self.path):
-            console.print(report.text, soft_wrap=True, highlight=False, markup=False)
+        whole, variation = True, Variation(self.source)
+        for folder in find_splits(self.path):
+            split = Split(folder)
+            report = describe_split(split)
+            lines = [report.text, *variation.lines(split)]
+            console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
             whole &= report.whole
         return 0 if whole else 1
 

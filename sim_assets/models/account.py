@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from scapo.types import Category
+from scapo.categories import Category
 from sim_assets.models.joints import Reduction, words
 from sim_assets.models.robot import Robot
 from sim_assets.models.sources import Traits
