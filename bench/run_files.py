@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -15,6 +14,8 @@ from scapo.training.run_folder import TIMING
 __all__ = ["METRICS", "TIMING", "Timing", "read_metrics", "read_timing"]
 
 METRICS = "metrics.jsonl"
+LARGEST = 10**18
+"""Of steps and losses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,9 +58,10 @@ def _row(line: str, where: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{where}: expected JSON, found {error}") from error
     row = cast("dict[str, Any]", value if isinstance(value, dict) else {})
-    if type(row.get("step")) is not int or type(row.get("stage")) is not str:
+    step = row.get("step")
+    if type(step) is not int or abs(step) > LARGEST or type(row.get("stage")) is not str:
         raise StoreError(f"{where}: expected an object with a whole 'step' and a 'stage' in text")
     for name, loss in row.items():
-        if name.startswith("loss") and not (type(loss) in (int, float) and math.isfinite(loss)):
+        if name.startswith("loss") and not (type(loss) in (int, float) and abs(loss) < LARGEST):
             raise StoreError(f"{where}: {name}: expected a finite number, found {loss!r}")
     return row

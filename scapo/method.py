@@ -122,7 +122,7 @@ def changes(
         default: Another of the same type.
         leave: Dotted names of fields that do not count.
 
-    >>> from scapo.registered.initialisation import DiscoveryConfig
+    >>> from scapo.registered.config import DiscoveryConfig
     >>> changed = DiscoveryConfig(draws=1, axis_weight=0.0, way_out=False)
     >>> changes(changed, DiscoveryConfig(), leave=["axis_weight"])
     ['way_out=False']

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import io
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 
 from scapo.drawing import BACKGROUND, PART_COLORS
@@ -121,16 +121,16 @@ def part_legend(figure: Figure, parts: Sequence[str], y: float) -> None:
 
 
 def plain(name: str) -> str:
-    """A name from a file as text of a figure: on one line, its dollars no formula."""
-    return one_line(name, 200).replace("$", r"\$")
+    """A name from a file as text of a figure: one line, no formula, boxes for unknown signs."""
+    font = get_font(findfont(FontProperties()))
+    line = "".join(c if font.get_char_index(ord(c)) else "□" for c in one_line(name, 200))
+    return line.replace("$", r"\$")
 
 
 def to_png(figure: Figure, **options: Any) -> bytes:  # noqa: ANN401 - of `savefig`
-    """The figure as PNG; the same figure is the same bytes. Signs that the font lacks are boxes."""
+    """The figure as PNG; the same figure is the same bytes."""
     buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(buffer, format="png", metadata={"Software": None}, **options)
+    figure.savefig(buffer, format="png", metadata={"Software": None}, **options)
     return buffer.getvalue()
 
 

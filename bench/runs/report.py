@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.run_files import METRICS, Timing, read_metrics, read_timing
-from scapo.store.checkpoint import read_checkpoint
+from scapo.store.checkpoint import RUN_FIELDS, read_checkpoint, require_fields
 from scapo.store.files import Header, write_bytes
 from scapo.training.log import PICTURES
 
@@ -42,9 +42,10 @@ def write_report(run: Path) -> Path:
     """Write the page of a run with a checkpoint; returns its path.
 
     Raises:
-        StoreError: No checkpoint there.
+        StoreError: No checkpoint there, or a file of the run that is not what it should be.
     """
     _, header = read_checkpoint(run)
+    require_fields(header, RUN_FIELDS, run)
     timing = read_timing(run)
     rows = read_metrics(run / METRICS)
     sections = [
@@ -93,7 +94,7 @@ def facts(header: Header) -> str:
 
 def arithmetic(training: Mapping[str, Any]) -> str:
     """Precision of the networks, and whether they were compiled."""
-    words = [training.get("precision", ""), "compiled" if training.get("compiled") else ""]
+    words = [str(training.get("precision", "")), "compiled" if training.get("compiled") else ""]
     return ", ".join(word for word in words if word)
 
 

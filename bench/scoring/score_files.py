@@ -37,8 +37,8 @@ COLUMNS = (
     "method", "variant", "seed", "data", "category", "split",
     "sample", "metric", "slot", "value", "unit",
 )  # fmt: skip
-LONGEST_NAME = 200
-"""Characters of a method's, variant's, data set's, category's or split's name."""
+LONGEST_NAME = 300
+"""Characters of a name; a variant is that of the predictions and the readings of the metrics."""
 _RANK = {metric.name: rank for rank, metric in enumerate(METRICS)}
 _UNITS = {(metric.name, unit) for metric in METRICS for unit in metric.units}
 

@@ -141,9 +141,11 @@ def robust_chamfer(
 
 @torch.no_grad()
 def farthest_points(
-    points: Float[Tensor, "*B N 3"], count: int, *, start: int = 0
+    points: Float[Tensor, "*B N D"], count: int, *, start: int = 0
 ) -> Int[Tensor, "*B {count}"]:
     """Indices of farthest-point sampling, beginning with point `start`.
+
+    Points of space, or features of any dimension D.
 
     Raises:
         ValueError: The cloud has fewer than `count` points, or no point `start`.
@@ -157,7 +159,7 @@ def farthest_points(
     return spread(points, count, start)
 
 
-def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
+def _spread(points: Float[Tensor, "*B N D"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
     chosen = torch.full(points.shape[:-2], start, device=points.device)
     distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
     indices = [chosen]
@@ -170,6 +172,18 @@ def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tens
 
 
 _spread_as_it_is = uncompiled(_spread)
+
+
+@torch.no_grad()
+def k_means(
+    points: Float[Tensor, "N D"], centres: Float[Tensor, "K D"], rounds: int
+) -> Float[Tensor, "K D"]:
+    """Centres after rounds of Lloyd's algorithm; one that loses all its points stays."""
+    for _ in range(rounds):
+        label = torch.cdist(points, centres).argmin(-1)
+        means = torch.stack([points[label == k].mean(0) for k in range(len(centres))])
+        centres = torch.where(means.isnan(), centres, means)
+    return centres
 
 
 MEAN_RADIUS = 0.25

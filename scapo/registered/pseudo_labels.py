@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The placements that search found for the training clouds, as the network's targets."""
+"""Pseudo-labels: placements that search found for the training clouds, the network's targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from scapo.registered.template import Placement
 
 
-class PseudoPlacements(nn.Module):
+class PseudoLabels(nn.Module):
     """Placements of training clouds as found, in the order of those clouds."""
 
     key: Tensor
@@ -26,7 +26,7 @@ class PseudoPlacements(nn.Module):
     trust: Tensor
     """Weight of each when the network learns."""
     belonging: Tensor
-    """Which points of each cloud belong to the object (bool)."""
+    """Which points of each cloud are inliers (bool)."""
     NAMES: ClassVar[tuple[str, ...]] = (
         "key",
         "rotation",
@@ -60,10 +60,10 @@ class PseudoPlacements(nn.Module):
             setattr(self, name, value.detach().clone())
 
     def placement(self) -> Placement:
-        """All of them, their hinges straight."""
+        """All of them, about the category's axes."""
         names = self.NAMES[1:6]
         values = {name: getattr(self, name) for name in names}
-        return Placement(**values, lean=torch.zeros_like(self.shift))
+        return Placement(**values, deviation=torch.zeros_like(self.shift))
 
     def _load_from_state_dict(
         self,

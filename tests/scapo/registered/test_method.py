@@ -14,8 +14,8 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.points import squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Step
-from scapo.registered.initialisation import DiscoveryConfig
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.config import DiscoveryConfig
+from scapo.registered.method import RegisteredConfig, RegisteredScapo, cpu_config
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
@@ -153,3 +153,17 @@ def test_of_many_clouds_only_the_learned_ones_have_placements():
     assert few._learned_row(at(0.0, row, generator(0))).tolist() == [2, 0]
     with pytest.raises(ValueError, match="expected clouds whose placements were found"):
         few.losses(batch, Labels(), at(0.0, row - 1, generator(0)))
+
+
+def variant(config: RegisteredConfig) -> str:
+    return RegisteredScapo(config, CATEGORIES["oven"], generator(0)).variant
+
+
+def test_departures_are_named_and_a_shorter_training_is_not() -> None:
+    assert variant(cpu_config()) == ""
+    assert variant(RegisteredConfig(learned=20, epochs=1, lr=1.0, batch=2)) == ""
+    discovery = DiscoveryConfig(held_frame=False, range_cost=0.0)
+    config = RegisteredConfig(strays="kept", settle=False, discovery=discovery)
+    assert variant(config) == (
+        "discovery.range_cost=0.0 discovery.held_frame=False strays=kept settle=False"
+    )
