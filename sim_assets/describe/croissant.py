@@ -15,7 +15,6 @@ from typing import Any
 from scapo.store import Split
 from scapo.store.files import sha256_bytes
 from scapo.store.manifest import Manifest
-from scapo.store.schema import LAYOUT
 from sim_assets.describe import terms
 
 CROISSANT = "croissant.json"
@@ -71,6 +70,7 @@ MEANING = {
     "joint_axis": "Unit vector of each joint, camera frame",
     "joint_state": "State of each joint from rest, rad or m; NaN: unknown",
     "visible": "Share of each part's surface that is seen; NaN: unknown",
+    "sensor": "Centre of the camera, m, for clouds that are not in its frame",
     "camera": "fx, fy, cx, cy, width, height in pixels",
     "instance": "Index into the manifest's list of objects",
 }
@@ -119,7 +119,7 @@ def croissant(split: Split) -> dict[str, Any]:
         "isLiveDataset": False,
         "distribution": _files(split),
         "recordSet": [_objects(manifest)],
-        "variableMeasured": _tensors(manifest),
+        "variableMeasured": _tensors(split),
         **_responsible(manifest),
     }
 
@@ -181,19 +181,19 @@ def _objects(manifest: Manifest) -> dict[str, Any]:
     }
 
 
-def _tensors(manifest: Manifest) -> list[dict[str, Any]]:
-    """The tensors of a shard: dtype and shape of one sample."""
-    length = {"N": manifest.points, "P": len(manifest.parts), "J": len(manifest.joints)}
+def _tensors(split: Split) -> list[dict[str, Any]]:
+    """The tensors of the first shard, others than ours too: dtype and shape of one sample."""
+    arrays = next(split.shards(), {})
     rows = []
-    for name, (dtype, dims) in LAYOUT.items():
-        if name == "color" and not manifest.options.get("color"):
-            continue
-        shape = [length[dim] if isinstance(dim, str) else dim for dim in dims]
-        value = f"{dtype} {tuple(shape)}" if shape else dtype
-        text = MEANING.get(name, "")
-        rows.append(
-            {"@type": "sc:PropertyValue", "name": name, "description": text, "value": value}
-        )
+    for name in (*(n for n in MEANING if n in arrays), *sorted(set(arrays) - set(MEANING))):
+        shape, dtype = arrays[name].shape[1:], arrays[name].dtype
+        row = {
+            "@type": "sc:PropertyValue",
+            "name": name,
+            "description": MEANING.get(name, "See the documentation of the set"),
+            "value": f"{dtype} {tuple(shape)}" if shape else f"{dtype}",
+        }
+        rows.append(row)
     return rows
 
 
