@@ -72,8 +72,9 @@ def measure(thing: ArticulatedObject, sample: Sample, exact: Sample) -> list[flo
     covered = (cKDTree(own).query(some)[0] < near).mean()
     shown = exact.observation.points.numpy()
     hidden = (cKDTree(shown).query(own)[0] > near).mean()
-    nearest = cKDTree(points).query(own)[1]
-    off = np.abs(((own - points[nearest]) * normals[nearest]).sum(1)) * 1000
+    nearest = cKDTree(points).query(own, k=4)[1]  # at an edge the nearest may be of another side
+    gaps = ((own[:, None] - points[nearest]) * normals[nearest]).sum(-1)
+    off = np.abs(gaps).min(1) * 1000
     counts = np.bincount(part.numpy()[part.numpy() >= 0], minlength=len(thing.visuals))
     foreign = 1 - len(own) / len(cloud)
     return [

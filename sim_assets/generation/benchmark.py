@@ -31,9 +31,8 @@ FORMAT = "scapo-benchmark/1"
 RECORD = "sim-art-2.json"
 IDS_FORMAT = "scapo-split-ids/1"
 IDS = "sim-art-2-ids.json"
-OLD_NAME = "sim-art/1"
 OLD_COMMIT = "01c5925"
-"""The last one that makes it, with the digests of results/sim-art-1."""
+"""Makes `sim-art/1`, with the digests of results/sim-art-1."""
 SEED = 2
 """Of the data, whatever the training seed."""
 Part = Literal["clean", "sensor", "complete", "real"]

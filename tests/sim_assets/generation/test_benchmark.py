@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scapo.categories import CATEGORIES
 from scapo.parallel.pool import Pool
 from scapo.store import open_split
 from sim_assets.__main__ import main
@@ -208,6 +209,31 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert run("benchmark", "sim-art/2", *flags, "--only", "chair") == 1
     assert capsys.readouterr().err.startswith("scapo-data: only: expected parts")
     assert run("benchmark", "sim-art/3", *flags) == 2
+
+
+def test_the_page_says_what_the_categories_are(repository):
+    """docs/benchmark.md against the table of categories and of sizes."""
+    text = (repository / "docs/benchmark.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    told = {row[0]: row[1:] for row in rows if len(row) == 6 and row[0] in CATEGORIES}
+    assert set(told) == set(CATEGORIES)
+    for name, category in CATEGORIES.items():
+        travel = ", ".join(
+            f"{np.degrees(joint.upper):g} deg" if joint.kind == "revolute" else f"{joint.upper:g} m"
+            for joint in category.joints
+        )
+        window = category.window
+        assert told[name] == [
+            ", ".join(category.parts),
+            travel,
+            f"{window.azimuth[0]:g} to {window.azimuth[1]:g}",
+            f"{window.elevation[0]:g} to {window.elevation[1]:g}",
+            f"{category.diagonal:g}",
+        ]
+    for split, (objects, each) in SIZES.items():
+        assert f"| `{split}` | {objects} x {each} |" in text
+    total = sum(objects * each for objects, each in SIZES.values()) * len(pieces()) // len(SIZES)
+    assert f"{total:,} clouds" in text
 
 
 def test_the_old_benchmark_names_the_commit_that_makes_it(tmp_path, capsys):
