@@ -42,7 +42,7 @@ from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.robot import Robot
 from sim_assets.models.sources import Traits, traits
 from sim_assets.models.validate import Repairs, check_object, check_poses, check_robot, refuse
-from sim_assets.objects import ArticulatedObject, Origin, Visual
+from sim_assets.objects import Account, ArticulatedObject, Origin, Visual
 
 __all__ = ["find", "instance_id", "read", "select"]
 
@@ -277,21 +277,18 @@ def _object(
             joint_names=tuple(joint.name for joint in joints),
             sign=tuple(rest.direction for rest in resting.rests),
             repairs=files.repairs.sentences(),
-            account=account(
-                resting.model.robot,
-                resting.model.known,
-                resting.reduction,
-                category,
-                _sides(visuals),
-                ratio,
-            ),
+            account=_told(resting, category, visuals, ratio),
         ),
     )
 
 
-def _sides(parts: tuple[tuple[Visual, ...], ...]) -> Float[np.ndarray, " 3"]:
+def _told(
+    resting: _Resting, category: Category, parts: tuple[tuple[Visual, ...], ...], ratio: float
+) -> Account:
     bounds = np.concatenate([visual.mesh.bounds for part in parts for visual in part])
-    return bounds.max(0) - bounds.min(0)
+    sides = bounds.max(0) - bounds.min(0)
+    model = resting.model
+    return account(model.robot, model.known, resting.reduction, category, sides, ratio)
 
 
 def _moved(visual: Visual, a_T_b: Pose) -> Visual:
