@@ -17,7 +17,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from scapo.types import Sample
 from sim_assets import generate_samples
@@ -69,10 +69,10 @@ def measure(thing: ArticulatedObject, sample: Sample, exact: Sample) -> list[flo
     assert part is not None  # noqa: S101
     own = cloud[part.numpy() >= 0]
     some = points[:: DENSE // SURFACE]
-    covered = (cKDTree(own).query(some)[0] < near).mean()
+    covered = (KDTree(own).query(some)[0] < near).mean()
     shown = exact.observation.points.numpy()
-    hidden = (cKDTree(shown).query(own)[0] > near).mean()
-    nearest = cKDTree(points).query(own, k=4)[1]  # at an edge the nearest may be of another side
+    hidden = (KDTree(shown).query(own)[0] > near).mean()
+    nearest = KDTree(points).query(own, k=4)[1]  # at an edge the nearest may be of another side
     gaps = ((own[:, None] - points[nearest]) * normals[nearest]).sum(-1)
     off = np.abs(gaps).min(1) * 1000
     counts = np.bincount(part.numpy()[part.numpy() >= 0], minlength=len(thing.visuals))

@@ -379,3 +379,17 @@ def test_when_several_objects_killed_a_worker_each_is_tried_apart(tmp_path, monk
     assert max(renderer.shown) == 3
     named = replace(died, job=again, label=assets[1].name)
     assert _without(named, strict=False).skip == {assets[1].name: "its process ..."}
+
+
+def test_complete_samples_are_turned_by_any_rotation():
+    """Uniform over all: each entry of the rotation is uniform in [-1, 1] (Archimedes), and the
+    object stays where the view has it."""
+    from sim_assets.sampling.viewpoints import generator, rotation
+
+    turns = np.stack([rotation(None, generator("turn", k).spawn(1)[0]) for k in range(4000)])
+    entries = np.sort(turns.reshape(len(turns), 9), axis=0)
+    expected = np.linspace(-1, 1, len(turns))[:, None]
+    assert np.abs(entries - expected).max() < 0.06  # Kolmogorov-Smirnov, 1.9 sqrt(1 / n) * 2
+    np.testing.assert_allclose(np.linalg.det(turns), 1)
+    again = rotation(None, generator("turn", 0).spawn(1)[0])
+    np.testing.assert_array_equal(turns[0], again)
