@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Truth by predicted slot, and the frames that predicted poses refer to.
+"""Which true part is compared with which predicted one, and the frames that predicted poses have.
 
-The order of the parts is chosen by labels alone (`ordering`), the canonical frame of a method
-that saw no poses is fitted on its predictions of the training split (docs/protocol.md). Both are
-the same for every method. Truth is relabelled in a copy, never in place.
-
-Labels of points, how they overlap, and the order of parts chosen from them (docs/protocol.md).
+The order of the parts is chosen by labels alone; the canonical frame of a method that saw no poses
+is fitted on its predictions of the training split. Both are the same for every method
+(docs/protocol.md). Truth is relabelled in a copy, never in place.
 """
 
 from __future__ import annotations
@@ -20,6 +18,21 @@ from jaxtyping import Bool, Float, Int, Num
 LabelOrder = Literal["sample", "dataset", "hungarian"]
 
 
+DRAWS = 100
+"""Random draws of the consensus search, each of `DRAW_SIZE` samples and each of one sample."""
+
+
+DRAW_SIZE = 5
+
+
+ROTATION_INLIER = 10.0
+"""Degrees."""
+
+
+TRANSLATION_INLIER = 0.25
+"""In the unit of the fit: 4 x mean radius for the benchmark."""
+
+
 def part_orders(parts: int) -> np.ndarray:
     """The orders tried by rule, (O, P), identity first: `order[p]` is the true part of slot p.
 
@@ -29,65 +42,6 @@ def part_orders(parts: int) -> np.ndarray:
     if parts == 2:
         return np.array([[0, 1], [1, 0]])
     return np.array([(0, *rest) for rest in permutations(range(1, parts))])
-
-
-def hard_labels(part: Num[np.ndarray, "B N *P"]) -> Int[np.ndarray, "B N"]:
-    """Labels of weights (B, N, P) by argmax, ties to the lower index; labels (B, N) unchanged.
-
-    A point whose weights are not all numbers is -1: it has no answer.
-    """
-    if part.ndim == 2:
-        return part.astype(np.int64, copy=False)
-    part = part.astype(np.float32, copy=False) if part.dtype == np.float16 else part
-    best = part[..., 0]
-    label = np.zeros(best.shape, np.int64)
-    undefined = np.isnan(best)
-    for index in range(1, part.shape[-1]):  # argmax over a short last axis is slow in numpy
-        larger = part[..., index] > best
-        label[larger] = index
-        best = np.where(larger, part[..., index], best)
-        undefined |= np.isnan(part[..., index])
-    label[undefined] = -1
-    return label
-
-
-def confusion(
-    part_true: Int[np.ndarray, "B N"], label: Int[np.ndarray, "B N"], parts: int
-) -> Int[np.ndarray, "B P P"]:
-    """Points of true part t in predicted slot q, (B, P, P), and answers outside 0..P-1 dropped.
-
-    Points with a negative true label are ignored.
-    """
-    batch = np.arange(len(part_true))[:, None] * parts
-    inside = (part_true >= 0) & (part_true < parts) & (label >= 0) & (label < parts)
-    index = ((batch + part_true) * parts + label)[inside]
-    counts = np.bincount(index, minlength=len(part_true) * parts * parts)
-    return counts.reshape(-1, parts, parts)
-
-
-def soft_confusion(
-    part_true: Int[np.ndarray, "B N"], weight: Num[np.ndarray, "B N P"]
-) -> Float[np.ndarray, "B P P"]:
-    """Predicted weight of slot q on the points of true part t, (B, P, P); NaN counts nothing."""
-    slots = weight.shape[-1]
-    weight = np.nan_to_num(weight.astype(np.float64))
-    rows = [np.einsum("bn,bnq->bq", part_true == part, weight) for part in range(slots)]
-    return np.stack(rows, 1)
-
-
-def as_weights(label: Int[np.ndarray, "B N"], parts: int) -> Float[np.ndarray, "B N P"]:
-    """One-hot weights; labels outside 0..P-1 have none."""
-    return (label[..., None] == np.arange(parts)).astype(np.float64)
-
-
-def overlap(
-    shared: Num[np.ndarray, "B P P"],
-    true_count: Num[np.ndarray, "B P"],
-    slot_count: Num[np.ndarray, "B P"],
-) -> Float[np.ndarray, "B P P"]:
-    """IoU of true part t and slot q from their intersection and sizes; 0/0 is NaN."""
-    union = true_count[:, :, None] + slot_count[:, None, :] - shared
-    return np.divide(shared, union, out=np.full(shared.shape, np.nan), where=union > 0)
 
 
 def choose_order(
@@ -126,14 +80,63 @@ def accuracies(
     return order_scores(counts, orders) / np.maximum(counts.sum((1, 2)), 1)[:, None]
 
 
-def joint_order(order: Int[np.ndarray, "B P"]) -> Int[np.ndarray, "B J"]:
-    """The true joint compared with predicted joint j, (B, J); -1 where none links those parts.
+def confusion(
+    part_true: Int[np.ndarray, "B N"], label: Int[np.ndarray, "B N"], parts: int
+) -> Int[np.ndarray, "B P P"]:
+    """Points of true part t in predicted slot q, (B, P, P), and answers outside 0..P-1 dropped.
 
-    Predicted joint j links slots 0 and j+1; a true joint exists between two parts if one of them
-    is the base.
+    Points with a negative true label are ignored.
     """
-    base, child = order[:, :1], order[:, 1:]
-    return np.where((base == 0) | (child == 0), np.maximum(base, child) - 1, -1)
+    batch = np.arange(len(part_true))[:, None] * parts
+    inside = (part_true >= 0) & (part_true < parts) & (label >= 0) & (label < parts)
+    index = ((batch + part_true) * parts + label)[inside]
+    counts = np.bincount(index, minlength=len(part_true) * parts * parts)
+    return counts.reshape(-1, parts, parts)
+
+
+def soft_confusion(
+    part_true: Int[np.ndarray, "B N"], weight: Num[np.ndarray, "B N P"]
+) -> Float[np.ndarray, "B P P"]:
+    """Predicted weight of slot q on the points of true part t, (B, P, P); NaN counts nothing."""
+    slots = weight.shape[-1]
+    weight = np.nan_to_num(weight.astype(np.float64))
+    rows = [np.einsum("bn,bnq->bq", part_true == part, weight) for part in range(slots)]
+    return np.stack(rows, 1)
+
+
+def overlap(
+    shared: Num[np.ndarray, "B P P"],
+    true_count: Num[np.ndarray, "B P"],
+    slot_count: Num[np.ndarray, "B P"],
+) -> Float[np.ndarray, "B P P"]:
+    """IoU of true part t and slot q from their intersection and sizes; 0/0 is NaN."""
+    union = true_count[:, :, None] + slot_count[:, None, :] - shared
+    return np.divide(shared, union, out=np.full(shared.shape, np.nan), where=union > 0)
+
+
+def hard_labels(part: Num[np.ndarray, "B N *P"]) -> Int[np.ndarray, "B N"]:
+    """Labels of weights (B, N, P) by argmax, ties to the lower index; labels (B, N) unchanged.
+
+    A point whose weights are not all numbers is -1: it has no answer.
+    """
+    if part.ndim == 2:
+        return part.astype(np.int64, copy=False)
+    part = part.astype(np.float32, copy=False) if part.dtype == np.float16 else part
+    best = part[..., 0]
+    label = np.zeros(best.shape, np.int64)
+    undefined = np.isnan(best)
+    for index in range(1, part.shape[-1]):  # argmax over a short last axis is slow in numpy
+        larger = part[..., index] > best
+        label[larger] = index
+        best = np.where(larger, part[..., index], best)
+        undefined |= np.isnan(part[..., index])
+    label[undefined] = -1
+    return label
+
+
+def as_weights(label: Int[np.ndarray, "B N"], parts: int) -> Float[np.ndarray, "B N P"]:
+    """One-hot weights; labels outside 0..P-1 have none."""
+    return (label[..., None] == np.arange(parts)).astype(np.float64)
 
 
 def is_swapped(order: Int[np.ndarray, "B P"]) -> Bool[np.ndarray, " B"]:
@@ -144,26 +147,14 @@ def is_swapped(order: Int[np.ndarray, "B P"]) -> Bool[np.ndarray, " B"]:
     return (order == part_orders(parts)[1]).all(1)
 
 
-DRAWS = 100
-"""Random draws of the consensus search, each of `DRAW_SIZE` samples and each of one sample."""
-DRAW_SIZE = 5
-ROTATION_INLIER = 10.0
-"""Degrees."""
-TRANSLATION_INLIER = 0.25
-"""In the unit of the fit: 4 x mean radius for the benchmark."""
+def joint_order(order: Int[np.ndarray, "B P"]) -> Int[np.ndarray, "B J"]:
+    """The true joint compared with predicted joint j, (B, J); -1 where none links those parts.
 
-
-def reorder_poses(
-    camera_T_part: Float[np.ndarray, "B P 4 4"],
-    order: Int[np.ndarray, "B P"],
-    symmetry: np.ndarray | None,
-) -> Float[np.ndarray, "B P 4 4"]:
-    """True poses by slot; rotations of swapped samples times `symmetry` from the right."""
-    poses = np.take_along_axis(camera_T_part, order[..., None, None], 1).astype(np.float64)
-    if symmetry is not None:
-        swapped = is_swapped(order)
-        poses[swapped, :, :3, :3] = poses[swapped, :, :3, :3] @ np.asarray(symmetry, np.float64)
-    return poses
+    Predicted joint j links slots 0 and j+1; a true joint exists between two parts if one of them
+    is the base.
+    """
+    base, child = order[:, :1], order[:, 1:]
+    return np.where((base == 0) | (child == 0), np.maximum(base, child) - 1, -1)
 
 
 def reorder_joints(
@@ -177,45 +168,17 @@ def reorder_joints(
     return out
 
 
-def nearest_orthogonal(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
-    """U V^T of the singular value decomposition, reflections included; NaN if not finite."""
-    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
-    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
-    return np.where(finite, u @ vt, np.nan)
-
-
-def project_rotations(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
-    """Nearest rotations (SVD, det +1); NaN where an entry is not finite."""
-    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
-    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return np.where(finite, u @ vt, np.nan)
-
-
-def rotation_degrees(
-    a: Float[np.ndarray, "*#B 3 3"], b: Float[np.ndarray, "*#B 3 3"]
-) -> Float[np.ndarray, "*B"]:
-    """Angle of a b^T in degrees by atan2, exact near 0 and near 180."""
-    relative = a @ np.swapaxes(b, -1, -2)
-    skew = relative - np.swapaxes(relative, -1, -2)
-    sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
-    cosine = np.trace(relative, axis1=-2, axis2=-1) - 1
-    return np.degrees(np.arctan2(sine, cosine))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
-    """Constant offsets of a method's part frames, and how many samples agree with them."""
-
-    offsets: Float[np.ndarray, "P 4 4"]
-    """own_T_part: camera_T_own @ own_T_part = camera_T_part; translations in units of `scale`."""
-    rotation_inliers: Float[np.ndarray, " P"]
-    """Share of the answered samples within 10 degrees."""
-    translation_inliers: Float[np.ndarray, " P"]
-    """Share of the answered samples within 0.25."""
-    answered: Int[np.ndarray, " P"]
-    """Samples with a finite pose."""
-    seed: int
+def reorder_poses(
+    camera_T_part: Float[np.ndarray, "B P 4 4"],
+    order: Int[np.ndarray, "B P"],
+    symmetry: np.ndarray | None,
+) -> Float[np.ndarray, "B P 4 4"]:
+    """True poses by slot; rotations of swapped samples times `symmetry` from the right."""
+    poses = np.take_along_axis(camera_T_part, order[..., None, None], 1).astype(np.float64)
+    if symmetry is not None:
+        swapped = is_swapped(order)
+        poses[swapped, :, :3, :3] = poses[swapped, :, :3, :3] @ np.asarray(symmetry, np.float64)
+    return poses
 
 
 def fit_calibration(
@@ -237,6 +200,21 @@ def fit_calibration(
         One offset per part; NaN for a part without a finite prediction.
     """
     return calibrate(camera_T_part_pred, camera_T_part_true, scale=scale, seed=seed).offsets
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """Constant offsets of a method's part frames, and how many samples agree with them."""
+
+    offsets: Float[np.ndarray, "P 4 4"]
+    """own_T_part: camera_T_own @ own_T_part = camera_T_part; translations in units of `scale`."""
+    rotation_inliers: Float[np.ndarray, " P"]
+    """Share of the answered samples within 10 degrees."""
+    translation_inliers: Float[np.ndarray, " P"]
+    """Share of the answered samples within 0.25."""
+    answered: Int[np.ndarray, " P"]
+    """Samples with a finite pose."""
+    seed: int
 
 
 def calibrate(
@@ -262,6 +240,17 @@ def calibrate(
         answered=np.array([part[3] for part in parts]),
         seed=seed,
     )
+
+
+def apply_calibration(
+    camera_T_part_pred: np.ndarray, offsets: np.ndarray, *, scale: np.ndarray | None = None
+) -> np.ndarray:
+    """Poses of the true frames: pred @ offsets, their translations times `scale` (B,)."""
+    pred = np.asarray(camera_T_part_pred, np.float64)
+    own_T_part = np.broadcast_to(np.asarray(offsets, np.float64), pred.shape).copy()
+    if scale is not None:
+        own_T_part[..., :3, 3] *= np.asarray(scale, np.float64)[:, None, None]
+    return pred @ own_T_part
 
 
 def _consensus(
@@ -293,15 +282,6 @@ def _consensus(
     return offset, float(near.mean()), float(close.mean()), count
 
 
-def _residuals(
-    rotation: Float[np.ndarray, "B 3 3"],
-    shift: Float[np.ndarray, "B 3"],
-    turn: Float[np.ndarray, "3 3"],
-    move: Float[np.ndarray, " 3"],
-) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
-    return rotation_degrees(rotation, turn), np.linalg.norm(shift - move, axis=1)
-
-
 def _agree(
     rotation: Float[np.ndarray, "B 3 3"],
     shift: Float[np.ndarray, "B 3"],
@@ -310,6 +290,15 @@ def _agree(
 ) -> tuple[Bool[np.ndarray, " B"], Bool[np.ndarray, " B"]]:
     angle, distance = _residuals(rotation, shift, turn, move)
     return angle <= ROTATION_INLIER, distance <= TRANSLATION_INLIER
+
+
+def _residuals(
+    rotation: Float[np.ndarray, "B 3 3"],
+    shift: Float[np.ndarray, "B 3"],
+    turn: Float[np.ndarray, "3 3"],
+    move: Float[np.ndarray, " 3"],
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
+    return rotation_degrees(rotation, turn), np.linalg.norm(shift - move, axis=1)
 
 
 def _refine(
@@ -338,12 +327,27 @@ def _refine(
     return turn, move
 
 
-def apply_calibration(
-    camera_T_part_pred: np.ndarray, offsets: np.ndarray, *, scale: np.ndarray | None = None
-) -> np.ndarray:
-    """Poses of the true frames: pred @ offsets, their translations times `scale` (B,)."""
-    pred = np.asarray(camera_T_part_pred, np.float64)
-    own_T_part = np.broadcast_to(np.asarray(offsets, np.float64), pred.shape).copy()
-    if scale is not None:
-        own_T_part[..., :3, 3] *= np.asarray(scale, np.float64)[:, None, None]
-    return pred @ own_T_part
+def nearest_orthogonal(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
+    """U V^T of the singular value decomposition, reflections included; NaN if not finite."""
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
+    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
+    return np.where(finite, u @ vt, np.nan)
+
+
+def project_rotations(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
+    """Nearest rotations (SVD, det +1); NaN where an entry is not finite."""
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
+    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.where(finite, u @ vt, np.nan)
+
+
+def rotation_degrees(
+    a: Float[np.ndarray, "*#B 3 3"], b: Float[np.ndarray, "*#B 3 3"]
+) -> Float[np.ndarray, "*B"]:
+    """Angle of a b^T in degrees by atan2, exact near 0 and near 180."""
+    relative = a @ np.swapaxes(b, -1, -2)
+    skew = relative - np.swapaxes(relative, -1, -2)
+    sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
+    cosine = np.trace(relative, axis1=-2, axis2=-1) - 1
+    return np.degrees(np.arctan2(sine, cosine))

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The errors of a prediction, one number per sample and slot, and the precision made of them.
 
-Pure functions of numpy arrays (docs/protocol.md). A slot is a predicted part or joint.
-What cannot be computed is NaN, never perfect. Angles are degrees, lengths those of the input.
-
-Average precision of Table 2: shares of samples within limits (docs/protocol.md).
+Pure functions of numpy arrays (docs/protocol.md). A slot is a predicted part or joint. What cannot
+be computed is NaN, never perfect. Angles are degrees, lengths those of the input.
 """
 
 from __future__ import annotations
@@ -31,128 +29,39 @@ from bench.matching import (
 ApRule = Literal["mean", "min", "per-part"]
 
 
-def average_precision(
-    *,
-    iou: np.ndarray,
-    part_rotation: np.ndarray,
-    part_translation: np.ndarray,
-    joint_direction: np.ndarray,
-    joint_pivot: np.ndarray,
-    rule: str = "mean",
-) -> dict[str, float]:
-    """Shares of Table 2 (docs/protocol.md): IoU over 75 and 50 %, errors under k degrees and k cm.
-
-    `mean`: per sample, the mean over its parts (joints) of each error is compared. `min`: every
-    part (joint) must pass. `per-part`: parts (joints) are counted one by one. Comparisons are
-    strict. An undefined error fails; an undefined IoU (the part neither there nor predicted) is
-    left out of its sample's mean or minimum, and fails where the sample has no other.
-
-    Args:
-        iou: (B, P).
-        part_rotation: (B, P), degrees.
-        part_translation: (B, P), metres.
-        joint_direction: (B, J), degrees.
-        joint_pivot: (B, J), metres.
-        rule: How the parts of a sample join.
-
-    Returns:
-        `seg_75, seg_50, joint_5, joint_10, joint_15, part_5, part_10, part_15` as fractions; NaN
-        for an empty batch.
-    """
-    passed = precision_passes(
-        iou=iou,
-        part_rotation=part_rotation,
-        part_translation=part_translation,
-        joint_direction=joint_direction,
-        joint_pivot=joint_pivot,
-        rule=rule,
-    )
-    return {name: float(p.mean()) if p.size else float("nan") for name, p in passed.items()}
-
-
-def precision_passes(
-    *,
-    iou: np.ndarray,
-    part_rotation: np.ndarray,
-    part_translation: np.ndarray,
-    joint_direction: np.ndarray,
-    joint_pivot: np.ndarray,
-    rule: str = "mean",
-) -> dict[str, np.ndarray]:
-    """What `average_precision` counts: bool (B,), or (B, P) and (B, J) for `per-part`."""
-    rule_name = rule.replace("_", "-")
-    if rule_name not in ("mean", "min", "per-part"):
-        raise ValueError(f"rule: expected mean, min or per-part, found {rule!r}")
-    joined = _Join(rule_name)
-    overlaps = joined.iou(np.asarray(iou, np.float64))
-    out = {f"seg_{k}": overlaps > k / 100 for k in (75, 50)}
-    for name, angle, length in (
-        ("joint", joint_direction, joint_pivot),
-        ("part", part_rotation, part_translation),
-    ):
-        degrees, metres = joined.errors(np.asarray(angle)), joined.errors(np.asarray(length))
-        for k in (5, 10, 15):
-            out[f"{name}_{k}"] = (degrees < k) & (metres < k / 100)
-    return out
-
-
-@dataclass(frozen=True, slots=True)
-class _Join:
-    """How the values of one sample's slots become what is compared."""
-
-    rule: str
-
-    def iou(self, values: Float[np.ndarray, "B P"]) -> np.ndarray:
-        if self.rule == "per-part":
-            return values
-        defined = ~np.isnan(values)
-        if self.rule == "min":
-            lowest = np.where(defined, values, np.inf).min(1)
-            return np.where(defined.any(1), lowest, np.nan)
-        total = np.where(defined, values, 0).sum(1)
-        return np.where(defined.any(1), total / np.maximum(defined.sum(1), 1), np.nan)
-
-    def errors(self, values: Num[np.ndarray, "B K"]) -> np.ndarray:
-        if self.rule == "per-part":
-            return values
-        return values.max(1) if self.rule == "min" else values.mean(1)
-
-
-__all__ = [
-    "METRICS",
-    "Agreement",
-    "ApRule",
-    "IouKind",
-    "Metric",
-    "PivotKind",
-    "RotationKind",
-    "agree",
-    "average_precision",
-    "joint_errors",
-    "pose_errors",
-    "precision_passes",
-    "sample_errors",
-    "state_errors",
-    "state_sign",
-    "unit",
-]
-
 IouKind = Literal["hard", "soft"]
+
+
 PivotKind = Literal["point-line", "line-line"]
+
+
 RotationKind = Literal["full", "folded"]
+
 
 PARALLEL = 1e-6
 """Sine below which two lines count as parallel."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Agreement:
-    """How predicted labels meet the true ones."""
+class Metric:
+    """What a name in the scores means."""
 
-    order: Int[np.ndarray, "B P"]
-    """The true part compared with each slot."""
-    iou: Float[np.ndarray, "B P"]
-    """In that order."""
+    name: str
+    per: Literal["part", "joint", "sample"]
+    higher_is_better: bool
+    units: tuple[str, ...]
+    """As in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
+
+
+METRICS = (
+    Metric(name="iou", per="part", higher_is_better=True, units=("1",)),
+    Metric(name="joint_direction", per="joint", higher_is_better=False, units=("deg",)),
+    Metric(name="joint_pivot", per="joint", higher_is_better=False, units=("r4", "m")),
+    Metric(name="joint_state", per="joint", higher_is_better=False, units=("deg", "r4", "m")),
+    Metric(name="part_rotation", per="part", higher_is_better=False, units=("deg",)),
+    Metric(name="part_translation", per="part", higher_is_better=False, units=("r4", "m")),
+    Metric(name="reconstruction", per="sample", higher_is_better=False, units=("r4", "m")),
+)
 
 
 def sample_errors(  # noqa: PLR0913
@@ -213,6 +122,16 @@ def sample_errors(  # noqa: PLR0913
         "part_rotation": turn,
         "part_translation": shift,
     }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """How predicted labels meet the true ones."""
+
+    order: Int[np.ndarray, "B P"]
+    """The true part compared with each slot."""
+    iou: Float[np.ndarray, "B P"]
+    """In that order."""
 
 
 def agree(
@@ -348,23 +267,88 @@ def state_sign(
     return np.where(reversed_[:, None], -sign, sign)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Metric:
-    """What a name in the scores means."""
+def average_precision(
+    *,
+    iou: np.ndarray,
+    part_rotation: np.ndarray,
+    part_translation: np.ndarray,
+    joint_direction: np.ndarray,
+    joint_pivot: np.ndarray,
+    rule: str = "mean",
+) -> dict[str, float]:
+    """Shares of Table 2 (docs/protocol.md): IoU over 75 and 50 %, errors under k degrees and k cm.
 
-    name: str
-    per: Literal["part", "joint", "sample"]
-    higher_is_better: bool
-    units: tuple[str, ...]
-    """As in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
+    `mean`: per sample, the mean over its parts (joints) of each error is compared. `min`: every
+    part (joint) must pass. `per-part`: parts (joints) are counted one by one. Comparisons are
+    strict. An undefined error fails; an undefined IoU (the part neither there nor predicted) is
+    left out of its sample's mean or minimum, and fails where the sample has no other.
+
+    Args:
+        iou: (B, P).
+        part_rotation: (B, P), degrees.
+        part_translation: (B, P), metres.
+        joint_direction: (B, J), degrees.
+        joint_pivot: (B, J), metres.
+        rule: How the parts of a sample join.
+
+    Returns:
+        `seg_75, seg_50, joint_5, joint_10, joint_15, part_5, part_10, part_15` as fractions; NaN
+        for an empty batch.
+    """
+    passed = precision_passes(
+        iou=iou,
+        part_rotation=part_rotation,
+        part_translation=part_translation,
+        joint_direction=joint_direction,
+        joint_pivot=joint_pivot,
+        rule=rule,
+    )
+    return {name: float(p.mean()) if p.size else float("nan") for name, p in passed.items()}
 
 
-METRICS = (
-    Metric(name="iou", per="part", higher_is_better=True, units=("1",)),
-    Metric(name="joint_direction", per="joint", higher_is_better=False, units=("deg",)),
-    Metric(name="joint_pivot", per="joint", higher_is_better=False, units=("r4", "m")),
-    Metric(name="joint_state", per="joint", higher_is_better=False, units=("deg", "r4", "m")),
-    Metric(name="part_rotation", per="part", higher_is_better=False, units=("deg",)),
-    Metric(name="part_translation", per="part", higher_is_better=False, units=("r4", "m")),
-    Metric(name="reconstruction", per="sample", higher_is_better=False, units=("r4", "m")),
-)
+def precision_passes(
+    *,
+    iou: np.ndarray,
+    part_rotation: np.ndarray,
+    part_translation: np.ndarray,
+    joint_direction: np.ndarray,
+    joint_pivot: np.ndarray,
+    rule: str = "mean",
+) -> dict[str, np.ndarray]:
+    """What `average_precision` counts: bool (B,), or (B, P) and (B, J) for `per-part`."""
+    rule_name = rule.replace("_", "-")
+    if rule_name not in ("mean", "min", "per-part"):
+        raise ValueError(f"rule: expected mean, min or per-part, found {rule!r}")
+    joined = _Join(rule_name)
+    overlaps = joined.iou(np.asarray(iou, np.float64))
+    out = {f"seg_{k}": overlaps > k / 100 for k in (75, 50)}
+    for name, angle, length in (
+        ("joint", joint_direction, joint_pivot),
+        ("part", part_rotation, part_translation),
+    ):
+        degrees, metres = joined.errors(np.asarray(angle)), joined.errors(np.asarray(length))
+        for k in (5, 10, 15):
+            out[f"{name}_{k}"] = (degrees < k) & (metres < k / 100)
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _Join:
+    """How the values of one sample's slots become what is compared."""
+
+    rule: str
+
+    def iou(self, values: Float[np.ndarray, "B P"]) -> np.ndarray:
+        if self.rule == "per-part":
+            return values
+        defined = ~np.isnan(values)
+        if self.rule == "min":
+            lowest = np.where(defined, values, np.inf).min(1)
+            return np.where(defined.any(1), lowest, np.nan)
+        total = np.where(defined, values, 0).sum(1)
+        return np.where(defined.any(1), total / np.maximum(defined.sum(1), 1), np.nan)
+
+    def errors(self, values: Num[np.ndarray, "B K"]) -> np.ndarray:
+        if self.rule == "per-part":
+            return values
+        return values.max(1) if self.rule == "min" else values.mean(1)

@@ -141,6 +141,10 @@ def load_method(
         raise StoreError(f"{path}: expected a method of {', '.join(methods)}, found {name!r}")
     entry = methods[name]
     config = config_from(entry.kind, header["config"], f"{path}: config")
-    method = entry.build(config, category(header["category"]), torch.Generator())
+    try:
+        method = entry.build(config, category(header["category"]), torch.Generator())
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        words = " ".join(str(error).split())
+        raise StoreError(f"{path}: config: expected one that builds, found {words}") from error
     load_arrays(method, arrays, path)
     return method.eval(), header

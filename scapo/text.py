@@ -22,14 +22,19 @@ def one_line(text: object, longest: int = LONGEST) -> str:
     >>> one_line("x" * 50, 20)
     'xxxxxxxxxxx … xxxxxx'
     """
-    line = str(text)
-    if len(line) > longest:
-        tail = longest // 3
-        line = f"{line[: longest - tail - 3]} … {line[len(line) - tail :]}"
+    line = _shortened(str(text), longest)
     line = " ".join(part.strip() for part in line.splitlines() if part.strip())
     if line.isprintable():
         return line
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return _shortened("".join(shown), longest)
+
+
+def _shortened(text: str, longest: int) -> str:
+    if len(text) <= longest:
+        return text
+    tail = longest // 3
+    return f"{text[: longest - tail - 3]} … {text[len(text) - tail :]}"
 
 
 def as_cell(text: str) -> str:

@@ -120,10 +120,10 @@ def part_legend(figure: Figure, parts: Sequence[str], y: float) -> None:
     )  # fmt: skip
 
 
-def plain(name: str) -> str:
+def plain(name: str, longest: int = 200) -> str:
     """A name from a file as text of a figure: one line, no formula, boxes for unknown signs."""
     font = get_font(findfont(FontProperties()))
-    line = "".join(c if font.get_char_index(ord(c)) else "□" for c in one_line(name, 200))
+    line = "".join(c if font.get_char_index(ord(c)) else "□" for c in one_line(name, longest))
     return line.replace("$", r"\$")
 
 

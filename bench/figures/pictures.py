@@ -142,10 +142,11 @@ def training_curve(metrics: Path, out: Path) -> None:
             panel.plot(
                 steps, values, linewidth=2 if total else 1.1,
                 color="black" if total else f"C{(number - 1) % 10}",
-                linestyle="-" if number <= 10 else "--", label=plain(name.removeprefix("loss/")),
+                linestyle="-" if number <= 10 else "--",
+                label=plain(name.removeprefix("loss/"), 40),
             )  # fmt: skip
         panel.set_yscale("symlog", linthresh=1e-3)
-        panel.set_title(plain(stage), fontsize=10)
+        panel.set_title(plain(stage, 40), fontsize=10)
         panel.set_xlabel("step", fontsize=9)
         panel.tick_params(labelsize=8)
         panel.grid(alpha=0.25)

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.pictures import Panel, PictureData
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation, deform_all
 from scapo.paper.skinning import Bones
+from scapo.pictures import Panel, PictureData
 
 Pictures = dict[str, PictureData]
 

@@ -22,7 +22,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import Category, JointKind
-from scapo.pictures import PictureData
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
@@ -43,6 +42,7 @@ from scapo.paper.objectives import Explanation, LossConfig, articulation, canoni
 from scapo.paper.refine import refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
+from scapo.pictures import PictureData
 from scapo.types import Joints, Labels, Observation, Prediction
 
 

@@ -65,29 +65,21 @@ REACHES = (0.06, 0.03, 0.0)
 """Of `observe_part_rotations` against a thin template, and of one that is a fan while it is made
 thin: normalised lengths."""
 FANNED = (0.1, 0.06, 0.04, 0.0, 0.0)
-ROUNDS = 3
-"""Of learning deviations and fitting the template to them, and of observing and refining."""
+ROUNDS = 3  # Of learning deviations and fitting the template to them, and of observing and refining
 LEAST_DEVIATION = 0.035
 """Standard deviation (rad) that is worth a fit: templates are not more exact."""
 RESTS, OUTWARDS = 4, 0.3
 """Rests that are tried beyond either end of the states, as far as this share of their range."""
-LEAST_POINTS = 12
-"""Of a part, of those of a view, for its rotation to count."""
-CHUNK = 64
-"""Views that are observed at once."""
-LARGEST = 0.35
-"""Rotation (rad) that a part is posed with."""
-SEAT = 0.15
-"""Share of a part's points, those nearest to its axis, that tell where its pivot sits."""
-REFINEMENT = StepOptions(steps=4, points=256)
-"""Steps that follow each observation."""
-TURNS = 3
-"""Gauss-Newton steps for each reach."""
+LEAST_POINTS = 12  # Of a part, of those of a view, for its rotation to count
+CHUNK = 64  # Views that are observed at once
+LARGEST = 0.35  # Rotation (rad) that a part is posed with
+SEAT = 0.15  # Share of a part's points, those nearest to its axis, that tell where its pivot sits
+REFINEMENT = StepOptions(steps=4, points=256)  # Steps that follow each observation
+TURNS = 3  # Gauss-Newton steps for each reach
 MEAN_SHARPNESS, SHARPNESS, ALONG = 60.0, 150.0, 0.25
 """Of `match_weight` with means, which are farther off, and with nearest points; and weight of
 distances along the surface there beside those across it (with means both count alike)."""
-DAMPING, MOST_TURN = 0.01, 0.15
-"""Added to the diagonal of a step's system, and rad of one step."""
+DAMPING, MOST_TURN = 0.01, 0.15  # Added to the diagonal of a step's system, and rad of one step
 
 
 def with_axis_deviation(

@@ -23,28 +23,20 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.gauge import along_main_directions, choose_axes, tells_frame
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.motion_segmentation import rebuild
-from scapo.registered.pose_refinement import (
-    SCALE_WEIGHT,
-    SHIFT_WEIGHT,
-    SLIDE_WEIGHT,
-    search_states,
-)
+from scapo.registered.pose_refinement import SCALE_WEIGHT, SHIFT_WEIGHT, SLIDE_WEIGHT, search_states
 from scapo.registered.template import ArticulatedTemplate, Placement, slides
 from scapo.registered.view_loss import sharpened, view_loss
 from scapo.registered.views import PartialViews
 
-POINTS = 128
-"""Of each view, drawn anew every step."""
-BETAS = (0.8, 0.95)
-"""Of Adam, shorter memories than usual: there are few steps."""
+POINTS = 128  # Of each view, drawn anew every step
+BETAS = (0.8, 0.95)  # Of Adam, shorter memories than usual: there are few steps
 LAST_RATE, FALLING = 0.1, 0.4
 """Share of every rate at the end, and share of the steps over which it falls."""
 TURN_RATE, STATE_RATE, SLIDING_RATE = 0.02, 0.03, 0.01
 """Rad a step; a state's where all joints slide is in normalised lengths."""
 TRANSLATION_RATE, SHIFT_RATE, SCALE_RATE = 0.004, 0.006, 0.008
 """Normalised lengths, and log scales, a step."""
-POINT_RATE, PIVOT_RATE = 0.002, 0.012
-"""Normalised lengths a step; pivots may be far off at first."""
+POINT_RATE, PIVOT_RATE = 0.002, 0.012  # Normalised lengths a step; pivots may be far off at first
 LOGIT_RATE, AXIS_RATE = 0.06, 0.05
 """Logits of parts, and of an axis of length 1 about its own direction, a step."""
 MEAN_SCALE_WEIGHT, MEAN_STATE_WEIGHT = 0.5, 0.02
@@ -53,19 +45,15 @@ MASS_WEIGHT, LEAST_MASS = 10.0, 0.06
 """Cost of a part with fewer than this share of the template's points."""
 FIRST_STATES = {"revolute": 1.7, "prismatic": 0.25}
 """Largest state, to either side, before anything is known: rad, and normalised length."""
-FIRST_GRID, GRID = 13, 11
-"""States tried of each joint before anything is known, and later."""
-ROUNDS = 4
-"""Of rebuilding and adjusting."""
+FIRST_GRID, GRID = 13, 11  # States tried of each joint before anything is known, and later
+ROUNDS = 4  # Of rebuilding and adjusting
 FIRST_STEPS, FIRST_SEARCHED, LAST_STEPS = 30, (0, 15), 20
 """Of a first fit: steps of each round, where states are searched in them, steps after the last."""
-LATE_STEPS = 25
-"""Of each round on inliers."""
+LATE_STEPS = 25  # Of each round on inliers
 BLUNT, SHARP, SHARPEST = (60.0, 200.0), (120.0, 300.0), (150.0, 400.0)
 """Sharpness (of `match_weight`) at the first and last step: of the first round, of the others of a
 first fit, and of those on inliers."""
-ROOM = 0.25
-"""Share of their range beyond which states of hinges are searched again."""
+ROOM = 0.25  # Share of their range beyond which states of hinges are searched again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,10 +127,7 @@ def wide_states(
 
 
 def refit(
-    candidate: Candidate,
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-    rounds: int = ROUNDS,
+    candidate: Candidate, config: DiscoveryConfig, generator: torch.Generator, rounds: int = ROUNDS
 ) -> Candidate:
     """Rounds on the inliers; the template changes in place."""
     template, views = candidate.template, candidate.inliers.views

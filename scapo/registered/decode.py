@@ -11,20 +11,12 @@ from torch import Tensor
 
 from scapo.geometry.points import Similarity, k_nearest
 from scapo.geometry.rigid import rigid
-from scapo.registered.template import (
-    ArticulatedTemplate,
-    PartPoses,
-    Placement,
-    oriented,
-    slides,
-)
+from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
 from scapo.registered.views import surface_normals
 from scapo.types import Joints, Prediction
 
-NEIGHBOURS = 12
-"""Template points that tell the part of an observed one."""
-REACH = 0.04
-"""Of their weights, normalised length; normals count as in `oriented`."""
+NEIGHBOURS = 12  # Template points that tell the part of an observed one
+REACH = 0.04  # Of their weights, normalised length; normals count as in `oriented`
 
 
 @torch.no_grad()

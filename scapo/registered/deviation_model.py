@@ -27,16 +27,14 @@ from torch import Tensor
 
 FREEDOM = 6.0
 """Of the Student distribution that observations are taken from: some views are placed wrongly."""
-HIDDEN = 1e3
-"""Variance (rad^2) of a rotation that was not seen: it does not count."""
+HIDDEN = 1e3  # Variance (rad^2) of a rotation that was not seen: it does not count
 RIDGE, LEAST_NOISE = 1e-3, 1e-6
 """Added to the load's system, and variance (rad^2) that noise has at least."""
 FIRST_NOISE, FIRST_LOAD = 0.004, 0.1
 """Variance (rad^2) and size (rad) that maximisation begins with, usual ones."""
 OUTLYING = 0.15
 """Rotation (rad) from which on an observation counts by its direction alone at the beginning."""
-STEPS, LAST_STEPS = 15, 50
-"""Of maximisation for each rest that is tried, and for the best."""
+STEPS, LAST_STEPS = 15, 50  # Of maximisation for each rest that is tried, and for the best
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,10 +32,8 @@ from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
 
-JUDGES = 4
-"""At most one view in so many is held out."""
-STRIDE = 3
-"""Views by which the draws are apart."""
+JUDGES = 4  # At most one view in so many is held out
+STRIDE = 3  # Views by which the draws are apart
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

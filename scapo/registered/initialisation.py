@@ -22,24 +22,15 @@ from scapo.registered.gauge import principal_frame
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
 from scapo.registered.pairwise import register_pairs, rotation_grid
 from scapo.registered.synchronisation import synchronise
-from scapo.registered.template import (
-    ArticulatedTemplate,
-    Placement,
-    spread_out,
-    surface_features,
-)
+from scapo.registered.template import ArticulatedTemplate, Placement, spread_out, surface_features
 from scapo.registered.views import PartialViews
 
-LEAST_VIEWS = 2
-"""That a template is first fitted to."""
-FRAME_EVERY = 4
-"""Of the normals, one in so many tells the main directions."""
+LEAST_VIEWS = 2  # That a template is first fitted to
+FRAME_EVERY = 4  # Of the normals, one in so many tells the main directions
 AXES_OF_SEVERAL = 2
 """Proposals of each joint that are fitted, at most, where a category has several joints."""
-TEMPLATE_EVERY = 2
-"""Of all moved and still points, one in so many may become one of the template's."""
-SURENESS = 3.0
-"""Logit of the part that a point begins in."""
+TEMPLATE_EVERY = 2  # Of all moved and still points, one in so many may become one of the template's
+SURENESS = 3.0  # Logit of the part that a point begins in
 
 
 def first_candidates(

@@ -22,18 +22,14 @@ from scapo.registered.template import SPAN, Placement
 
 RANGE_COST = 0.03
 """Mean loss that a radian of range may save; a sliding joint pays it per mean radius (0.25)."""
-OUTSIDE_COST = 0.3
-"""Largest loss added to a hypothesis outside the limits."""
-SLOPE = 2.0
-"""Loss added per unit (rad, or mean radius) outside the limits, up to `OUTSIDE_COST`."""
+OUTSIDE_COST = 0.3  # Largest loss added to a hypothesis outside the limits
+SLOPE = 2.0  # Loss added per unit (rad, or mean radius) outside the limits, up to `OUTSIDE_COST`
 RADII = 1 / MEAN_RADIUS
 """Mean radii in a normalised length, the unit in which sliding joints are compared with hinges."""
 WIDTHS = (0.3, 1.0, 15)
 """Narrower ranges that are tried, as shares of the whole: least, largest, how many."""
-PLACES = 20
-"""Of such a range within the whole, for each whole width that it may move by."""
-LEAST_SPAN = 1e-3
-"""Rad or normalised length: states that do not differ still have a range."""
+PLACES = 20  # Of such a range within the whole, for each whole width that it may move by
+LEAST_SPAN = 1e-3  # Rad or normalised length: states that do not differ still have a range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

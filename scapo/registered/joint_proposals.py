@@ -25,36 +25,24 @@ from scapo.registered.pairwise import HIDDEN_COST, NearestGrid
 from scapo.registered.template import SPAN, PartPoses, across_axis
 from scapo.registered.views import PartialViews
 
-COUNT = 128
-"""Points of a view that are asked whether they moved."""
+COUNT = 128  # Points of a view that are asked whether they moved
 STIFFNESS = 3.0
 """How far the answers spread: less than those between parts, whose borders are known better."""
-MOVED = 0.3
-"""Share of all points, the least confirmed, that count as moved."""
-ROUNDS = 20
-"""Of k-means that shares moved points among joints."""
-PAIRS = 100
-"""Pairs of views that every axis is tried on."""
-LEAST_MOVED = 12
-"""Points of a view that must have moved for it to be in a pair."""
-CARRIED = 40
-"""Points of a view that are carried by every candidate motion, those that moved first."""
-TIE = 0.01
-"""Largest random number by which points are drawn among those that moved alike."""
-AWAY = 9.0
-"""Normalised place of points that did not move: nothing is carried there."""
+MOVED = 0.3  # Share of all points, the least confirmed, that count as moved
+ROUNDS = 20  # Of k-means that shares moved points among joints
+PAIRS = 100  # Pairs of views that every axis is tried on
+LEAST_MOVED = 12  # Points of a view that must have moved for it to be in a pair
+CARRIED = 40  # Points of a view that are carried by every candidate motion, those that moved first
+TIE = 0.01  # Largest random number by which points are drawn among those that moved alike
+AWAY = 9.0  # Normalised place of points that did not move: nothing is carried there
 OPENED, TURNED = (0.06, 0.5), (math.radians(12), math.radians(100))
 """Least and largest amount that is tried, to either side: normalised length, and rad."""
-AMOUNTS = 6
-"""Amounts to either side."""
+AMOUNTS = 6  # Amounts to either side
 PIVOTS, BEYOND = 9, 0.08
 """Places of a hinge along either direction across it, up to this far beyond the moved points."""
-SHARPNESS = 300.0
-"""Of `match_weight`, per squared normalised length."""
-BEHIND = 0.04
-"""Normalised length behind what a camera saw at which a point is hidden."""
-UNSEEN = 0.8
-"""Share of what a hidden point would at most be worth that it is given."""
+SHARPNESS = 300.0  # Of `match_weight`, per squared normalised length
+BEHIND = 0.04  # Normalised length behind what a camera saw at which a point is hidden
+UNSEEN = 0.8  # Share of what a hidden point would at most be worth that it is given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -66,20 +66,14 @@ from scapo.registered.template import (
 from scapo.registered.views import NEIGHBOURS, PartialViews, observe
 from scapo.types import Labels, Observation, Prediction, Supervision
 
-LEAST_CLOUDS = 8
-"""Views that a template can be found in at all, two of which judge."""
-SAMPLED = 2
-"""Times `points` that are drawn from a cloud, of which the farthest are learned from."""
-NOISE = 0.003
-"""Normalised length: standard deviation of the points' noise while the network learns."""
+LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
+SAMPLED = 2  # Times `points` that are drawn from a cloud, of which the farthest are learned from
+NOISE = 0.003  # Normalised length: standard deviation of the points' noise while the network learns
 TURN = 0.15
 """Rad: standard deviation of the turn away from a principal frame while the network learns."""
-LAST_RATE = 0.01
-"""Share of the learning rate at the end."""
-ROOM = 0.2
-"""Share of the inliers' range beyond which `refine` searches states."""
-FRAMES = 4
-"""Hypotheses of the network for each cloud, one in each of its principal frames."""
+LAST_RATE = 0.01  # Share of the learning rate at the end
+ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
+FRAMES = 4  # Hypotheses of the network for each cloud, one in each of its principal frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,36 +27,29 @@ from scapo.registered.template import (
 from scapo.registered.view_loss import SEEN_WITHIN, match_weight
 from scapo.registered.views import PartialViews
 
-OBSERVERS = 24
-"""Views, at most, that are asked about the points of the others."""
+OBSERVERS = 24  # Views, at most, that are asked about the points of the others
 PRIOR = 0.3
 """Views added to those that agree and to those that do not: where none tells, support is a half."""
 SAME_PLACE = 400.0
 """Sharpness (of `match_weight`, per squared normalised length) of having the same surface."""
 FACING = 0.3
 """Cosine above which normals are alike at all, and above which a surface faces the camera."""
-ALIKE = 0.5
-"""Cosine beyond `FACING` that it takes for normals to be wholly alike."""
+ALIKE = 0.5  # Cosine beyond `FACING` that it takes for normals to be wholly alike
 MISSED = 0.5
 """How much surface that should be there and is not speaks against a motion; empty space: 1."""
 NEIGHBOUR, FLATNESS = 0.06, 3.0
 """Of neighbours on a surface: normalised length, and weight of 1 - cosine of their normals."""
-STIFFNESS = 10.0
-"""How far answers spread, against what each point says itself."""
+STIFFNESS = 10.0  # How far answers spread, against what each point says itself
 LEAST_COUNT, ALL_COUNT = 40, 6000
 """Points of a view that the template is built from, at least, and of all views together."""
 BASE_BONUS = 0.1
 """Log support by which the base wins over a part: what nothing tells apart stays with it."""
-SUPPORTED = 0.4
-"""Share of the views that must agree for a point to enter the template."""
-SEEN = 0.05
-"""Share of the observers that must have seen it, or more than one view."""
-LEAST_GOOD = 50
-"""Points without which the template stays as it was."""
+SUPPORTED = 0.4  # Share of the views that must agree for a point to enter the template
+SEEN = 0.05  # Share of the observers that must have seen it, or more than one view
+LEAST_GOOD = 50  # Points without which the template stays as it was
 AVERAGED = 0.03
 """Reach (normalised length) of the mean that makes a template point of those about it."""
-SURENESS = 6.0
-"""Logit of a part per unit of log support."""
+SURENESS = 6.0  # Logit of a part per unit of log support
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

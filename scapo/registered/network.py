@@ -22,18 +22,15 @@ from scapo.geometry.rigid import project_rotation
 
 SIGNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 """Flips of the principal axes that keep the frame right-handed."""
-CAMERA_UNIT = 4.0
-"""Camera positions are learned in this many normalised units."""
+CAMERA_UNIT = 4.0  # Camera positions are learned in this many normalised units
 WIDTH, NEIGHBOURS = 48, 12
 """Channels of the narrowest layer, and nearest points that the first one sees."""
 POINT_SCALE, STEP_SCALE = 1 / MEAN_RADIUS, 8.0
 """By which coordinates, and offsets to neighbours, are brought to about 1."""
-TINY, TINY_TRUST = 1e-9, 1e-6
-"""Least divisors: sums of weights of points, and of clouds."""
+TINY, TINY_TRUST = 1e-9, 1e-6  # Least divisors: sums of weights of points, and of clouds
 GOOD = 0.06
 """Normalised length within which a vote is good; sureness learns exp(-off^2 / (2 GOOD^2))."""
-SMOOTH = 1e-6
-"""Squared normalised length within which the distance of votes is smooth."""
+SMOOTH = 1e-6  # Squared normalised length within which the distance of votes is smooth
 WEIGHTS = {"votes": 1.0, "sureness": 0.05, "part": 0.03, "state": 0.1, "size": 0.05, "camera": 0.2}
 """Of the terms of the loss: the votes make the pose, the others should not outweigh them."""
 

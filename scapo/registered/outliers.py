@@ -14,12 +14,9 @@ from torch import Tensor
 
 from scapo.geometry.points import nearest
 
-SPACING = 7
-"""The distance to the nearest but so many, itself the first, is a point's spacing."""
-REACH = 3.5
-"""Points nearer than this many typical spacings belong together."""
-LEAST = 0.03
-"""Share of the points that a cluster must hold."""
+SPACING = 7  # The distance to the nearest but so many, itself the first, is a point's spacing
+REACH = 3.5  # Points nearer than this many typical spacings belong together
+LEAST = 0.03  # Share of the points that a cluster must hold
 MOST = 2048
 """Points whose distances are taken to one another; of a larger cloud the rest go by the nearest."""
 

@@ -24,51 +24,34 @@ from scapo.registered.gauss_newton import by_turn, damped_step
 from scapo.registered.view_loss import match_weight, sharpened
 from scapo.registered.views import TINY, PartialViews
 
-HIDDEN_COST = 0.55
-"""Largest cost of a point about which the other view says nothing."""
-HIDDEN_BEHIND = 0.05
-"""Normalised length behind what a camera saw at which a point is hidden."""
-EXTENT = 0.8
-"""Half the side of the cube of nearest points; a cloud reaches about 0.6."""
+HIDDEN_COST = 0.55  # Largest cost of a point about which the other view says nothing
+HIDDEN_BEHIND = 0.05  # Normalised length behind what a camera saw at which a point is hidden
+EXTENT = 0.8  # Half the side of the cube of nearest points; a cloud reaches about 0.6
 CELLS = 28
 """Of that cube along either side: 0.057 each, half of which is what a look-up may be wrong by."""
-BLOCK = 4096
-"""Cells whose nearest points are sought at once: a few MB."""
+BLOCK = 4096  # Cells whose nearest points are sought at once: a few MB
 SPIRAL = 1.533751168755204288118041
 """The second winding number of the super-Fibonacci spiral, the positive root of x^4 = x + 4."""
 SLIDES = (20.0, 60.0)
 """Sharpness (of `match_weight`, per squared normalised length) as a view slides to its matches."""
-SCORED = 140.0
-"""Sharpness of the score."""
-ICP = (60.0, 400.0)
-"""Sharpness of the first and the last step of refinement."""
-ICP_STEPS, ICP_POINTS = 8, 96
-"""Of refinement, and points of the moved view in it."""
+SCORED = 140.0  # Sharpness of the score
+ICP = (60.0, 400.0)  # Sharpness of the first and the last step of refinement
+ICP_STEPS, ICP_POINTS = 8, 96  # Of refinement, and points of the moved view in it
 SAME_SIDE = 0.62
 """Share of the grid that is tried: rotations under which both cameras look from one side."""
 COARSE, FINE, FINAL = 28, 96, 192
 """Points of a view for a first score of all rotations, a second of those left, and the last."""
-SLID = 48
-"""Points of a view, at most, that slide to their matches."""
-LEFT = 96
-"""Rotations of a pair that are scored a second time."""
-KEPT = 4
-"""Modes of a pair, and two more of those that are refined: some will come to the same pose."""
+SLID = 48  # Points of a view, at most, that slide to their matches
+LEFT = 96  # Rotations of a pair that are scored a second time
+KEPT = 4  # Modes of a pair, and two more of those that are refined: some will come to the same pose
 SPARE = 2
-APART = 28.0
-"""Degrees between hypotheses that are refined: what a refinement bridges."""
-DISTINCT = 20.0
-"""Degrees within which refined hypotheses are the same mode."""
-CLEAR = 0.1
-"""Margin of a pair that has one mode only; larger than nearly all that rivals leave."""
-ALONG = 0.1
-"""Weight of distances along the surface beside those across it."""
-DAMPING = 1e-4
-"""Share of the system's mean diagonal that is added to it."""
-NONE = 1e-8
-"""And beyond that, for pairs without a match."""
-CHUNK = 8
-"""Pairs registered at once: what keeps the work in a core's cache."""
+APART = 28.0  # Degrees between hypotheses that are refined: what a refinement bridges
+DISTINCT = 20.0  # Degrees within which refined hypotheses are the same mode
+CLEAR = 0.1  # Margin of a pair that has one mode only; larger than nearly all that rivals leave
+ALONG = 0.1  # Weight of distances along the surface beside those across it
+DAMPING = 1e-4  # Share of the system's mean diagonal that is added to it
+NONE = 1e-8  # And beyond that, for pairs without a match
+CHUNK = 8  # Pairs registered at once: what keeps the work in a core's cache
 REPEATED, CHOSEN = 10.0, 100.0
 """Added to a score, of at most 1, where it is near one that was chosen, and where it was itself."""
 

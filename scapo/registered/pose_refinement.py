@@ -31,32 +31,25 @@ from scapo.registered.view_loss import (
 )
 from scapo.registered.views import PartialViews
 
-SCALE_WEIGHT = 0.05
-"""Of the squared log scales."""
+SCALE_WEIGHT = 0.05  # Of the squared log scales
 SHIFT_WEIGHT = 0.2
 """Of a sliding part's squared place across its axis, per squared normalised length."""
 SLIDE_WEIGHT = 0.7
 """Of a sliding joint's states about their mean: without it a part slides right through the body to
 explain its far side."""
-ALONG = 0.25
-"""Weight of distances along the surface beside those across it."""
+ALONG = 0.25  # Weight of distances along the surface beside those across it
 SHARPNESS = (80.0, 250.0)
 """Of `match_weight`, per squared normalised length, at the first and the last step."""
 DAMPING, LEAST_DAMPING = 0.02, 0.2
 """Share of the system's diagonal that is added to it, and what is added beyond: coordinates that no
 point tells stay."""
-MOST_TURN, MOST_STATE = 0.4, 0.4
-"""Rad (or normalised length) of one step."""
-MOST_MOVE, MOST_SCALE = 0.1, 0.15
-"""Normalised length, and log scale, of one step."""
-POSE = 9
-"""Coordinates of a placement before its states: turn, translation, log scales."""
+MOST_TURN, MOST_STATE = 0.4, 0.4  # Rad (or normalised length) of one step
+MOST_MOVE, MOST_SCALE = 0.1, 0.15  # Normalised length, and log scale, of one step
+POSE = 9  # Coordinates of a placement before its states: turn, translation, log scales
 SHIFTS = tuple(0.05 * k for k in range(-5, 6))
 """Places of a sliding part across its joint's axis that are tried; the mean radius is 0.25."""
-CHUNK = 256
-"""Hypotheses refined at once, with templates of up to `LIGHT` points."""
-LIGHT = 400
-"""Points of the template that the search uses until its last steps."""
+CHUNK = 256  # Hypotheses refined at once, with templates of up to `LIGHT` points
+LIGHT = 400  # Points of the template that the search uses until its last steps
 RANKED, BACKWARD = 250.0, 2.0
 """Sharpness of the loss that ranks hypotheses, and weight in it of the template's visible points:
 what was not seen tells wrong ones."""

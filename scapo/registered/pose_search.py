@@ -24,54 +24,38 @@ from scapo.registered.pose_refinement import CHUNK, LIGHT, StepOptions, refine, 
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.views import TINY, PartialViews
 
-VIEWS = 64
-"""Views searched at once: each has `SearchSpace.keep` hypotheses."""
+VIEWS = 64  # Views searched at once: each has `SearchSpace.keep` hypotheses
 STATES_OF_ONE, STATES_OF_EACH = 7, 4
 """States of the grid where the category has one joint, and of each joint where it has more."""
 ROOM_SLIDING, ROOM = 0.1, 0.3
 """Share of the inliers' range beyond which states are searched: sliding joints, and hinges."""
-POINTS, TEMPLATE_POINTS = 48, 64
-"""Of a view, and of the template, that score the grid."""
+POINTS, TEMPLATE_POINTS = 48, 64  # Of a view, and of the template, that score the grid
 FREE, BEHIND = 0.5, 0.04
 """Cost of a template point in space that the camera saw empty, and how far (normalised length) in
 front of what it saw that begins."""
-CHARGED = 0.1
-"""Share of the inliers' range beyond which a hypothesis is charged for its state."""
-NEAR = 0.3
-"""Cosine of directions above which a camera is near one that inliers used."""
-LEAST_TRIED = 8
-"""Rotations tried for each hypothesis that is kept, if few cameras are near."""
-SPACED = 25.0
-"""Degrees between hypotheses of the grid that are kept, about its spacing."""
-RIVAL = 30.0
-"""Degrees from the best placement from which on another is its rival."""
-NO_RIVAL = 2.0
-"""Loss in place of a rival's where there is none: about the largest there is."""
-AGAIN = 120.0
-"""Sharpness of the loss by which states are tried again before the last steps."""
-AGAIN_EVERY = 3
-"""Of the points, one in so many enters it."""
+CHARGED = 0.1  # Share of the inliers' range beyond which a hypothesis is charged for its state
+NEAR = 0.3  # Cosine of directions above which a camera is near one that inliers used
+LEAST_TRIED = 8  # Rotations tried for each hypothesis that is kept, if few cameras are near
+SPACED = 25.0  # Degrees between hypotheses of the grid that are kept, about its spacing
+RIVAL = 30.0  # Degrees from the best placement from which on another is its rival
+NO_RIVAL = 2.0  # Loss in place of a rival's where there is none: about the largest there is
+AGAIN = 120.0  # Sharpness of the loss by which states are tried again before the last steps
+AGAIN_EVERY = 3  # Of the points, one in so many enters it
 RUNGS = (
     (StepOptions(steps=3, points=48, template_points=64), 16),
     (StepOptions(steps=5, points=96), 6),
 )
 """Of `successive_halving`: steps, and how many distinct hypotheses of a view go on."""
-RUNG_APART = 12.0
-"""Degrees between those."""
-LONG = StepOptions(steps=10, points=128)
-"""Steps of those that are left."""
+RUNG_APART = 12.0  # Degrees between those
+LONG = StepOptions(steps=10, points=128)  # Steps of those that are left
 LAST = StepOptions(steps=4, points=256)
 """Their last, with all points of cloud and template: what ranks them should be sharp."""
-STATES = (150.0, 250.0)
-"""Sharpness of the losses by which the winner's states are tried."""
+STATES = (150.0, 250.0)  # Sharpness of the losses by which the winner's states are tried
 STATE_GRID, STATE_EVERY = 13, 2
 """States that are tried then, and one in so many points that they are tried with."""
-STATE_STEPS = StepOptions(steps=5, points=256)
-"""Steps that follow."""
-LOSS_SHARE = 0.5
-"""Of a placement's loss that counts against its margin when views are ranked."""
-LEAST_INLIERS = 8
-"""Views that a template is fitted to at least."""
+STATE_STEPS = StepOptions(steps=5, points=256)  # Steps that follow
+LOSS_SHARE = 0.5  # Of a placement's loss that counts against its margin when views are ranked
+LEAST_INLIERS = 8  # Views that a template is fitted to at least
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,9 +132,7 @@ def find_inliers(
         config: Rotations, and the cost of a range of states.
         anywhere: Whether cameras are sought anywhere.
     """
-    hypotheses = search_near(candidate, views, config, anywhere=anywhere)
-    limits = _narrowest(candidate, hypotheses, config)
-    found = hypotheses.best(limits)
+    found, _ = _within_limits(candidate, search_near(candidate, views, config, anywhere), config)
     kept = most_confident(found, share)
     inliers = Inliers(views=take(views, kept), placement=take(found.placement, kept))
     return Candidate(template=candidate.template, inliers=inliers)
@@ -169,24 +151,21 @@ def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConf
 
     The range counts because a joint along a wrong axis explains almost as much with more of it.
     """
-    hypotheses = search_near(candidate, views, config)
-    limits = _narrowest(candidate, hypotheses, config)
-    return float(hypotheses.best(limits).loss.mean()) + config.range_cost * limits.extent()
+    found, limits = _within_limits(candidate, search_near(candidate, views, config), config)
+    return float(found.loss.mean()) + config.range_cost * limits.extent()
 
 
-def _narrowest(
+def _within_limits(
     candidate: Candidate, hypotheses: Hypotheses, config: DiscoveryConfig
-) -> JointLimits:
-    kinds = candidate.template.kinds
-    return narrowest_limits(hypotheses.placement, hypotheses.loss, kinds, config.range_cost)
+) -> tuple[SearchResult, JointLimits]:
+    """The best hypotheses within the narrowest joint limits, and those."""
+    kinds, placement = candidate.template.kinds, hypotheses.placement
+    limits = narrowest_limits(placement, hypotheses.loss, kinds, config.range_cost)
+    return hypotheses.best(limits), limits
 
 
 def search_near(
-    candidate: Candidate,
-    views: PartialViews,
-    config: DiscoveryConfig,
-    *,
-    anywhere: bool = False,
+    candidate: Candidate, views: PartialViews, config: DiscoveryConfig, anywhere: bool = False
 ) -> Hypotheses:
     """Every view over rotations and states, cameras near those of inliers or anywhere."""
     template, inliers = candidate.template, candidate.inliers

@@ -27,16 +27,8 @@ class PseudoLabels(nn.Module):
     """Weight of each when the network learns."""
     belonging: Tensor
     """Which points of each cloud are inliers (bool)."""
-    NAMES: ClassVar[tuple[str, ...]] = (
-        "key",
-        "rotation",
-        "translation",
-        "log_scale",
-        "state",
-        "shift",
-        "camera",
-        "trust",
-    )
+    PLACEMENT: ClassVar = ("rotation", "translation", "log_scale", "state", "shift")
+    NAMES: ClassVar = ("key", *PLACEMENT, "camera", "trust")
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,23 +38,13 @@ class PseudoLabels(nn.Module):
 
     def set(self, key: Tensor, placement: Placement, camera: Tensor, trust: Tensor) -> None:
         """Replace all."""
-        values = (
-            key,
-            placement.rotation,
-            placement.translation,
-            placement.log_scale,
-            placement.state,
-            placement.shift,
-            camera,
-            trust,
-        )
+        values = (key, *(getattr(placement, name) for name in self.PLACEMENT), camera, trust)
         for name, value in zip(self.NAMES, values, strict=True):
             setattr(self, name, value.detach().clone())
 
     def placement(self) -> Placement:
         """All of them, about the category's axes."""
-        names = self.NAMES[1:6]
-        values = {name: getattr(self, name) for name in names}
+        values = {name: getattr(self, name) for name in self.PLACEMENT}
         return Placement(**values, deviation=torch.zeros_like(self.shift))
 
     def _load_from_state_dict(

@@ -17,10 +17,8 @@ from scapo.geometry.points import gather
 from scapo.registered.template import oriented
 from scapo.registered.views import PartialViews
 
-NORMAL_WEIGHT = 1.5
-"""Of 1 - cosine of the normals beside sharpness times squared distance."""
-GRAZING = 0.1
-"""Cosine of a surface's normal and the ray above which a camera sees it."""
+NORMAL_WEIGHT = 1.5  # Of 1 - cosine of the normals beside sharpness times squared distance
+GRAZING = 0.1  # Cosine of a surface's normal and the ray above which a camera sees it
 SEEN_WITHIN = 0.03
 """Normalised length along the ray within which a point counts as what the camera saw there."""
 

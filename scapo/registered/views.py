@@ -19,18 +19,14 @@ from torch import Tensor
 from scapo.geometry.points import farthest_points, gather, k_nearest
 from scapo.geometry.rigid import rotation_between
 
-FAR = 1e3
-"""Depth of a cell that shows background, in normalised lengths: beyond all that is tried."""
+FAR = 1e3  # Depth of a cell that shows background, in normalised lengths: beyond all that is tried
 CELLS = 24
 """Of the depth image along either side: an object's 0.05, so that rows of points leave no gaps."""
-MARGIN = 1.001
-"""Of the depth image about the points, so that rounding leaves none outside."""
-TINY = 1e-6
-"""Least divisor, of sides of images and sums of weights that may be 0."""
+MARGIN = 1.001  # Of the depth image about the points, so that rounding leaves none outside
+TINY = 1e-6  # Least divisor, of sides of images and sums of weights that may be 0
 LEAST_DEPTH = 1e-3
 """Normalised length that depths are divided by at least: no image of points behind the camera."""
-NEIGHBOURS = 16
-"""Points that tell a normal: fewer follow the noise, more round off the edges."""
+NEIGHBOURS = 16  # Points that tell a normal: fewer follow the noise, more round off the edges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,9 +105,7 @@ def observe(
 
 
 def surface_normals(
-    points: Float[Tensor, "B K 3"],
-    cloud: Float[Tensor, "B N 3"],
-    camera: Float[Tensor, "B 3"],
+    points: Float[Tensor, "B K 3"], cloud: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B K 3"]:
     """Direction of least spread of the nearest points of `cloud`, turned towards the camera."""
     around = torch.cat(
@@ -138,9 +132,7 @@ def _look(camera: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 3"]:
 
 
 def _depth_image(
-    points: Float[Tensor, "B N 3"],
-    camera: Float[Tensor, "B 3"],
-    look: Float[Tensor, "B 3 3"],
+    points: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"], look: Float[Tensor, "B 3 3"]
 ) -> tuple[Float[Tensor, "B G G"], Float[Tensor, "B 2"], Float[Tensor, " B"]]:
     seen = (points - camera[:, None]) @ look.mT
     image = seen[..., :2] / seen[..., 2:].clamp_min(LEAST_DEPTH)

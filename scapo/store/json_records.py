@@ -98,13 +98,15 @@ class _Reader:
         for name, (item, _) in known.items():
             if name not in found and item.default is item.default_factory is MISSING:
                 raise self.error(f"{where}: expected field {name!r}, found none")
-        return kind(
-            **{
-                name: self.value(hint, found[name], f"{where}{self.link}{name}")
-                for name, (_, hint) in known.items()
-                if name in found
-            }
-        )
+        values = {
+            name: self.value(hint, found[name], f"{where}{self.link}{name}")
+            for name, (_, hint) in known.items()
+            if name in found
+        }
+        try:
+            return kind(**values)
+        except (ArithmeticError, LookupError, TypeError, ValueError) as problem:
+            raise self.error(f"{where}: expected fields that fit, found {problem}") from problem
 
     def value(self, hint: Any, value: object, where: str) -> Any:  # noqa: ANN401
         """A JSON value as the annotation has it; lists become tuples."""

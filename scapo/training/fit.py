@@ -186,7 +186,7 @@ class Trainer:
     def _stages(self, moments: Arrays | None) -> None:
         position, stages = self.state.position, self.method.stages()
         if moments is not None and position.scaler:
-            self.descent.scaler.load_state_dict(position.scaler)
+            self._load_scaler(position.scaler)
         if not stages:
             self._start(Stage(name="", epochs=0, lr=0.0))
         while position.stage < len(stages):
@@ -203,6 +203,15 @@ class Trainer:
             self._draw(stage)
             self._save(None)
         self._save(None, finished=True)
+
+    def _load_scaler(self, state: dict[str, int | float]) -> None:
+        try:
+            self.descent.scaler.load_state_dict(state)
+        except (KeyError, RuntimeError) as error:
+            raise StoreError(
+                f"{self.folder.path / checkpoint.TRAINING}: header: position: scaler: expected the "
+                f"state of a gradient scaler, found one without {error}"
+            ) from error
 
     def _start(self, stage: Stage) -> None:
         """The method's start of a stage, by the first rank for all; saved, as it may take long."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The data card, `card.md` beside every manifest: what the data is, how made, how to read it.
 
-A function of manifest and shards alone: no machine's paths; the same bytes each time.
+A function of manifest and shards alone: no date, no machine's paths; the same bytes each time.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from scapo.geometry.camera import Intrinsics
 from scapo.store import Split, write_bytes
 from scapo.store.manifest import Manifest
+from scapo.text import as_markdown
 from sim_assets.describe.croissant import CROISSANT, croissant_text
 from sim_assets.describe.info import histograms
 from sim_assets.describe.terms import citation, licence, terms
@@ -45,7 +46,7 @@ def card(split: Split) -> str:
     """The card as Markdown."""
     manifest = split.manifest
     sections = [
-        f"# {manifest.category}, {manifest.split}",
+        as_markdown(f"# {manifest.category}, {manifest.split}"),
         _summary(split),
         "## Source and terms",
         terms(manifest),
@@ -58,7 +59,7 @@ def card(split: Split) -> str:
         "## States, views and points",
         "Least value, distribution, greatest value and mean over the samples. Azimuth and "
         "elevation are those of the camera about the object's front.",
-        "```\n" + "\n".join(line.strip() for line in histograms(split)) + "\n```",
+        "```\n" + "\n".join(line.replace("`", "'") for line in histograms(split)) + "\n```",
         "## How to read it",
         "Points and labels are in the camera frame (x right, y down, z forward), metres and "
         "radians; `part` 255 is background. `manifest.json` has frames, sources and digests.",
@@ -139,10 +140,10 @@ def _joints(manifest: Manifest) -> str:
         travel = f"{joint.lower * factor:.4g} to {joint.upper * factor:.4g} {unit}"
         ends = f"{manifest.parts[joint.parent]} to {manifest.parts[joint.child]}"
         rows.append((f"{number}", joint.kind, ends, travel))
-    parts = ", ".join(f"{number} {name}" for number, name in enumerate(manifest.parts))
+    parts = ", ".join(f"{number} {as_markdown(p)}" for number, p in enumerate(manifest.parts))
     return f"Parts: {parts}.\n\n" + _table(("joint", "kind", "links", "travel"), rows)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(map(as_markdown, line))} |" for line in lines)

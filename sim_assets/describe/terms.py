@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import re
+
 from scapo.store.manifest import Manifest
+from scapo.text import as_markdown
 
 LICENCE = "MIT"
 LICENCE_URL = "https://spdx.org/licenses/MIT.html"
@@ -32,7 +35,7 @@ def terms(manifest: Manifest) -> str:
     source = manifest.options.get("source")
     if is_own(manifest):
         return OWN
-    return MODELS if source == "urdf" else FOREIGN.format(source=source)
+    return MODELS if source == "urdf" else FOREIGN.format(source=as_markdown(f"{source}"))
 
 
 def licence(manifest: Manifest) -> str:
@@ -44,9 +47,10 @@ def citation(manifest: Manifest) -> str:
     """BibTeX of the data, by its digest: the year is that of what made it."""
     version = manifest.versions.get("scapo", "")
     note = f"version {version}, " if version else ""
+    name = re.sub(r"[^\w .,-]", "_", f"{manifest.category}, {manifest.split}")
     return (
         "@misc{scapo_data,\n"
-        f"  title = {{scapo: {manifest.category}, {manifest.split}}},\n"
+        f"  title = {{scapo: {name}}},\n"
         f"  author = {{{{{CREATOR}}}}},\n"
         "  year = {2026},\n"
         f"  note = {{{note}digest {manifest.digest[:16]}}}\n"

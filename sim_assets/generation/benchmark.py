@@ -13,14 +13,16 @@ import json
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from scapo.categories import CATEGORIES
 from scapo.store import write_bytes
-from sim_assets.generation.assets import Asset
-from sim_assets.generation.generate import Made, Running, Workers, generate, open_workers
+from scapo.store.json_records import from_json, read_json
+from scapo.text import one_line
+from sim_assets.generation.assets import Asset, UrdfAsset
+from sim_assets.generation.generate import Made, Running, generate, open_workers
 from sim_assets.generation.plan import Request
 from sim_assets.generation.real import RealModels, readable, real_models
 from sim_assets.generation.request import make_request, versions
@@ -181,42 +183,78 @@ def make_benchmark(
     task, running = task or Task(), running or Running()
     real = find_real(task)
     chosen = pieces(task.only, real)
-    with open_workers(running) as pool:  # they take seconds to start: one set for all pieces
-        for piece in chosen:
+    planned = [_request(piece, task, real) for piece in chosen]
+    with open_workers(running, *(p.request for p in planned)) as pool:  # one set for all pieces
+        for piece, first in zip(chosen, planned, strict=True):
+            plan = first
             started = time.monotonic()
-            request, assets, unreadable = _request(piece, task, real, pool)
+            if real is not None and piece.part == "real":
+                models, unreadable = readable(real.models[piece.category], pool)
+                plan = replace(_request(piece, task, real, models), unreadable=unreadable)
             made = generate(
-                request,
-                assets,
+                plan.request,
+                plan.assets,
                 out / piece.name,
-                versions(request.settings.backend),
+                versions(plan.request.settings.backend),
                 running,
                 pool,
             )
-            made = replace(made, failed={**unreadable, **made.failed})
+            made = replace(made, failed={**plan.unreadable, **made.failed})
             done = Done(piece=piece, made=made, seconds=time.monotonic() - started)
             _record(out / RECORD, done)
             _record_ids(out / IDS, done)
             yield done
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Planned:
+    """What a piece asks for."""
+
+    request: Request
+    assets: Sequence[Asset]
+    unreadable: Mapping[str, str] = field(default_factory=dict)
+    """Models that cannot be read, and why."""
+
+
 def _request(
-    piece: Piece, task: Task, real: RealModels | None, pool: Workers
-) -> tuple[Request, list[Asset], Mapping[str, str]]:
-    """What to make, of which objects, and the models that cannot be read."""
+    piece: Piece, task: Task, real: RealModels | None, models: Sequence[UrdfAsset] | None = None
+) -> _Planned:
+    """What to make of which objects; of real ones `models`, by default all of the category."""
     options = piece.options(task.sizes or SIZES, task.backend)
     if real is None or piece.part != "real":
-        return *make_request(piece.category, options), {}
-    models, unreadable = readable(real.models[piece.category], pool)
-    options = replace(
-        options,
-        source=str(real.root.absolute()),
-        count=REAL_VIEWS * len(models),
-        instances=len(models),
-    )
-    request, assets = make_request(piece.category, options, models)
-    chosen = {**request.source_options, "chosen_by": f"benchmark {NAME} --real"}
-    return replace(request, source_options=chosen), assets, unreadable
+        request, assets = make_request(piece.category, options)
+        return _Planned(request=request, assets=assets)
+    chosen = real.models[piece.category] if models is None else models
+    source = str(real.root.absolute())
+    options = replace(options, source=source, count=REAL_VIEWS * len(chosen), instances=len(chosen))
+    request, assets = make_request(piece.category, options, chosen)
+    told = {**request.source_options, "chosen_by": f"benchmark {NAME} --real"}
+    return _Planned(request=replace(request, source_options=told), assets=assets)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Split:
+    """What is read of a split's entry."""
+
+    samples: int
+    bytes: int
+    seconds: float
+    digest: str
+    shards_kept: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Record:
+    """What is read of the record."""
+
+    splits: dict[str, _Split]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Listed:
+    """What is read of the list of objects."""
+
+    splits: dict[str, tuple[str, ...]]
 
 
 def _record(path: Path, done: Done) -> None:
@@ -261,13 +299,13 @@ def read_record(path: Path, expected: str = FORMAT) -> dict[str, Any]:
     """
     if not path.exists():
         return {"format": expected, "benchmark": NAME, "seed": SEED, "splits": {}}
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, found {error}") from error
+    record = read_json(path)
     if not isinstance(record, dict) or record.get("format") != expected:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f"{path}: expected format {expected!r}, found {found!r}")
+        raise ValueError(
+            f"{path}: expected format {expected!r}, found {one_line(repr(found), 200)}"
+        )
+    from_json(_Record if expected == FORMAT else _Listed, record, str(path))
     return record
 
 

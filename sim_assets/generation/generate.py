@@ -28,6 +28,7 @@ from sim_assets.generation.plan import (
     samples_per_instance,
     used_instances,
 )
+from sim_assets.generation.request import make_request, versions
 from sim_assets.generation.shard import (
     TOGETHER,
     ShardDone,
@@ -36,9 +37,10 @@ from sim_assets.generation.shard import (
     render_shard,
     render_shard_alike,
 )
+from sim_assets.generation.workers import planned_workers
+from sim_assets.options import DataOptions
 
 Progress = Callable[[str, int, int], None]
-Workers = AbstractPool[Any, Any]
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -50,7 +52,7 @@ class Running:
     """How a split is made: nothing here changes its bytes."""
 
     workers: int | None = 1
-    """None: one per core, of this machine or of the cluster."""
+    """None: as many as pay on this machine (`planned_workers`); of a cluster one per core."""
     engine: Engine = "local"
     timeout: float = 300.0
     """Seconds without a sign of life after which an object counts as hanging."""
@@ -72,13 +74,33 @@ class Made:
     """Shards that were there already."""
 
 
-def open_workers(running: Running) -> AbstractPool[Any, Any]:
-    """The workers that do it, as a context manager.
+def open_workers(running: Running, *requests: Request) -> AbstractPool[Any, Any]:
+    """The workers that make these requests, as a context manager.
 
     Raises:
         ValueError: Their number is out of range.
     """
-    return open_pool(running.engine, running.workers, timeout=running.timeout)
+    workers = running.workers
+    if workers is None and running.engine == "local":
+        workers = planned_workers(*requests)
+    return open_pool(running.engine, workers, timeout=running.timeout)
+
+
+def make_split(
+    category: str, options: DataOptions, out: Path, running: Running | None = None
+) -> Made:
+    """Make OUT/CATEGORY/SPLIT, or finish one that was begun: `scapo-data generate`.
+
+    Raises:
+        ValueError: An option is out of range, the category is unknown, or has no such objects.
+        RenderError: The backend does not work here.
+        GenerateError: See `generate`.
+    """
+    if options.source != "procedural":  # workers elsewhere stand in another folder
+        options = replace(options, source=str(Path(options.source).absolute()))
+    request, assets = make_request(category, options)
+    found = versions(request.settings.backend)
+    return generate(request, assets, out / category / options.split, found, running)
 
 
 def generate(
@@ -97,7 +119,7 @@ def generate(
         folder: Of the split.
         versions: Of what makes the pixels, for the manifest.
         running: How.
-        pool: Of `open_workers(running)`, to use the same workers for several splits; it stays open.
+        pool: Of `open_workers`, to use the same workers for several splits; it stays open.
 
     Raises:
         GenerateError: The folder holds something else, is in use or cannot be written; no object
@@ -113,7 +135,7 @@ def generate(
     }
     with (
         Ledger(folder, identity, versions) as ledger,
-        open_workers(running) if pool is None else nullcontext(pool) as workers,
+        open_workers(running, request) if pool is None else nullcontext(pool) as workers,
     ):
         finished = ledger.finished()
         complete = _complete(ledger, finished)

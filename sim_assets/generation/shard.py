@@ -18,6 +18,7 @@ import numpy as np
 
 from scapo.parallel.pool import Report, describe_error
 from scapo.store import SAMPLES, read_header, write
+from scapo.store.json_records import from_json
 from sim_assets.generation.assets import Asset
 from sim_assets.generation.plan import Entry, Piece, Request, ShardPlan, instance_record
 from sim_assets.generation.request import versions
@@ -282,7 +283,10 @@ def _write(
 
 
 def read_done(path: Path, sha256: str) -> ShardDone:
-    """What a finished shard says of itself; `sha256` is that of its bytes."""
-    header = read_header(path, SAMPLES)
-    names = ("count", "plan", "views", "draws", "failed")
-    return ShardDone(file=path.name, sha256=sha256, **{name: header[name] for name in names})
+    """What a finished shard says of itself; `sha256` is that of its bytes.
+
+    Raises:
+        StoreError: It is none of ours.
+    """
+    known = {"file": path.name, "sha256": sha256}
+    return from_json(ShardDone, {**read_header(path, SAMPLES), **known}, str(path))

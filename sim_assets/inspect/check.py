@@ -18,10 +18,12 @@ from typing import Any, Literal, get_args
 from scapo.categories import JointKind, JointSpec
 from scapo.parallel.pool import Outcome, Pool, Report
 from scapo.store.files import write_bytes
+from scapo.text import one_line
 from sim_assets.generation.request import make_request
 from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.joints import Candidate, candidates
 from sim_assets.models.library import find, source_root
+from sim_assets.models.limits import bounded, limited_memory
 from sim_assets.models.reader import Model, load, read
 from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.validate import AssetError, Repairs, refuse
@@ -48,7 +50,7 @@ class Options:
     timeout: float = 120.0
     """Seconds for one model."""
     memory: int = 4 << 30
-    """Bytes for one model."""
+    """Bytes for one model, to read it and to show it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,37 +138,20 @@ def exit_code(results: Iterable[Result]) -> int:
 
 def _job(model: _Model, send: Report) -> Result:
     """In the worker."""
-    limit_memory(model.options.memory)
-    send(str(model.urdf), 0)
-    return check_one(model.urdf, model.root, model.options)
+    send(one_line(model.urdf), 0)
+    with limited_memory(model.options.memory):
+        return check_one(model.urdf, model.root, model.options)
 
 
 def _result(outcome: Outcome[_Model, Result]) -> Result:
     model = outcome.job
-    name = model.urdf.resolve().relative_to(model.root.resolve()).as_posix()
+    folder = model.urdf.parent.resolve()  # the file itself may be a link to anywhere
+    name = one_line((folder / model.urdf.name).relative_to(model.root.resolve()).as_posix())
     result = outcome.result
     if result is None:
         reason = f"{name}: expected to be read, found that {outcome.reason}"
         return Result(path=name, status="refused", reason=reason)
     return replace(result, path=name, reason=result.reason.replace(f"{model.root}/", ""))
-
-
-def limit_memory(extra: int) -> None:
-    """Let this process take `extra` bytes more than it has now; beyond it memory errors arise.
-
-    Does nothing where the system has no such limit (Windows) or does not tell its size (macOS).
-    """
-    try:
-        import resource
-
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except (ImportError, OSError):
-        return
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    wanted = pages * resource.getpagesize() + extra
-    if hard != resource.RLIM_INFINITY:
-        wanted = min(wanted, hard)
-    resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
 
 
 def check_one(urdf: Path, root: Path, options: Options) -> Result:
@@ -223,8 +208,12 @@ def show(urdf: Path, thing: ArticulatedObject) -> None:
 
 def _general(urdf: Path, root: Path, repairs: Repairs) -> tuple[tuple[str, ...], int]:
     """Joints that some category could use, and the number of triangles."""
-    model = load(SourceFiles(urdf=urdf, root=root, repairs=repairs))
-    surfaces = model.surfaces
+    with bounded(urdf):
+        return _found(load(SourceFiles(urdf=urdf, root=root, repairs=repairs)))
+
+
+def _found(model: Model) -> tuple[tuple[str, ...], int]:
+    urdf, surfaces = model.robot.path, model.surfaces
     found, reasons = [], []
     for kind in get_args(JointKind):
         spec = JointSpec(kind=kind, parent=0, child=1, lower=0.0, upper=math.pi)

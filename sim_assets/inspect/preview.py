@@ -17,6 +17,7 @@ from scapo.drawing import PART_COLORS, draw_axis, draw_cloud
 from scapo.store import Split, StoreError, write_bytes
 from scapo.store.manifest import Manifest
 from scapo.store.schema import UNLABELLED
+from scapo.text import one_line
 from sim_assets.describe.info import describe_state, find_splits
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ TILE = 2.1
 DPI = 150
 PAPER, INK, FAINT = "#ffffff", "#222222", "#777777"
 AXIS = "#111111"
+LONGEST_NAME = 40
+LETTERS = {chr(c) for c in (*range(32, 127), *range(161, 0x250), *range(0x370, 0x530))} | {"–"}
+"""Latin, Greek and Cyrillic, which matplotlib's own font draws."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,11 +130,18 @@ def _picture(blocks: list[list[Tile]]) -> bytes:
 def _heading(figure, manifest: Manifest, top: float, height: float) -> None:  # noqa: ANN001
     x, y = 0.012, top - 0.3 / height
     title = f"{manifest.category}  {manifest.split}"
-    words = [figure.text(x, y, title, fontsize=11, weight="bold", color=INK)]
+    style = {"color": INK, "fontsize": 11, "weight": "bold"}
+    words = [figure.text(x, y, _plain(title), parse_math=False, **style)]
     for p, name in enumerate(manifest.parts):
         x += (words[-1].get_window_extent().width + 0.15 * DPI) / figure.bbox.width
         color = PART_COLORS[p % len(PART_COLORS)]
-        words.append(figure.text(x, y, f"● {name}", fontsize=9, color=color))
+        label = f"● {_plain(name)}"
+        words.append(figure.text(x, y, label, parse_math=False, fontsize=9, color=color))
+
+
+def _plain(name: str) -> str:
+    """A name from a file, short and in letters that the font has."""
+    return "".join(c if c in LETTERS else "?" for c in one_line(name, LONGEST_NAME))
 
 
 def _draw(axes: Axes, tile: Tile) -> None:

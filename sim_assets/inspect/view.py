@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from scapo.drawing import BACKGROUND, PART_COLORS
 from scapo.store import Split
 from scapo.store.manifest import Manifest
-from scapo.store.samples import TENSORS, SampleDataset
+from scapo.store.schema import UNLABELLED
 from scapo.text import one_line
 from sim_assets.describe.info import describe_state, find_splits
 from sim_assets.generation.assets import RecoverError, recover
@@ -35,6 +35,18 @@ from sim_assets.objects import ArticulatedObject
 PAINTS = ("part", "colour")
 FRAMES = ("object", "camera")
 OPACITY = 0.4
+SHOWN = (
+    "points",
+    "part",
+    "camera_T_part",
+    "joint_pivot",
+    "joint_axis",
+    "joint_state",
+    "visible",
+    "camera",
+    "instance",
+)
+"""Tensors of a split."""
 LONGEST_TEXT = 300
 """Characters of a line from a file."""
 AXIS = (17, 17, 17)
@@ -121,7 +133,7 @@ class Viewer:
             self.split = self.splits[self.split_box.value]
             manifest = self.split.manifest
             colored = bool(manifest.options.get("color"))
-            self.samples = SampleDataset(self.split, (*TENSORS, "color") if colored else TENSORS)
+            self.samples = self.split.arrays(*SHOWN, *(["color"] if colored else []))
             self.paint_box.disabled = not colored
             if self.sample_box is not None:
                 self.sample_box.remove()
@@ -137,7 +149,7 @@ class Viewer:
         """Show a sample of the split."""
         with self.lock:
             self.number = min(number, self.split.manifest.count - 1)
-            self.row = {name: t.numpy() for name, t in self.samples[self.number].items()}
+            self.row = {name: array[self.number] for name, array in self.samples.items()}
             if int(self.row["instance"]) != self.instance:
                 self.instance = int(self.row["instance"])
                 self._load()
@@ -185,7 +197,7 @@ class Viewer:
         row, part = self.row, self.row["part"]
         digits = "".join(color[1:] for color in (*PART_COLORS, BACKGROUND))
         colors = np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 3)
-        paint = colors[np.where(part < 0, len(PART_COLORS), part % len(PART_COLORS))]
+        paint = colors[np.where(part == UNLABELLED, len(PART_COLORS), part % len(PART_COLORS))]
         if self.paint_box.value == PAINTS[1] and "color" in row:
             paint = row["color"]
         return DisplayedSample(

@@ -34,7 +34,7 @@ from sim_assets.models.validate import (
     Repairs,
     check_mimics,
     check_tree,
-    number,
+    read_number,
     refuse,
 )
 from sim_assets.models.xml import Element, children, local, read_xml
@@ -128,7 +128,7 @@ class _Reader:
         text = (text or "").strip()
         words = text.replace(",", " ").replace(";", " ").split()
         try:
-            values = tuple(number(word) for word in words)
+            values = tuple(read_number(word) for word in words)
         except ValueError as error:
             raise self.error(where, "numbers", repr(text)) from error
         if len(values) not in counts:

@@ -62,7 +62,7 @@ def read_file(path: Path, limit: int) -> bytes:
         raise refuse(path, "the name of a file", str(error)) from error
 
 
-def number(word: object) -> float:
+def read_number(word: object) -> float:
     """A number as files have it: ASCII digits, without the underscores that Python takes.
 
     Raises:

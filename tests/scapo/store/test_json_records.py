@@ -87,6 +87,22 @@ def test_another_type_is_refused_by_name(change: dict[str, Any], message: str) -
         from_json(Outer, {"count": 1, **change}, "f", others="refuse")
 
 
+@dataclass(frozen=True)
+class Divided:
+    whole: int
+    by: int = 1
+
+    def __post_init__(self) -> None:
+        if self.whole % self.by:
+            raise ValueError(f"{self.by} does not divide {self.whole}")
+
+
+@pytest.mark.parametrize(("by", "found"), [(0, "integer .*by zero"), (2, "2 does not divide 3")])
+def test_what_a_record_says_of_itself_is_told_with_its_place(by: int, found: str) -> None:
+    with pytest.raises(StoreError, match=f"f: expected fields that fit, found {found}"):
+        from_json(Divided, {"whole": 3, "by": by}, "f")
+
+
 def test_a_field_without_default_must_be_there() -> None:
     with pytest.raises(StoreError, match="f: expected field 'count', found none"):
         from_json(Outer, {}, "f")

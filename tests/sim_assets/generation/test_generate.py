@@ -289,7 +289,7 @@ def test_interrupted_then_killed_then_finished_gives_the_same_bytes(tmp_path, re
     folder = tmp_path / "laptop/train"
     process, errors = stop(tmp_path, repository, 1, signal.SIGINT)
     assert process.returncode == 130
-    assert errors.splitlines()[-1].endswith("batches it up where it was")
+    assert errors.splitlines()[-1].endswith("takes it up where it was")
     assert "Traceback" not in errors
     assert json.loads((folder / PLAN).read_text())["identity"]["count"] == 600
     process, _ = stop(tmp_path, repository, 3, signal.SIGKILL)
