@@ -8,6 +8,7 @@ answer there: it is counted and its scores are empty.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from jaxtyping import Bool, Num
 from safetensors import SafetensorError, safe_open
 
 from bench.compat.readings import RECORD
+from scapo.geometry.matrices import rotation_error
 from scapo.store import PREDICTIONS, Split, StoreError, read_header, write
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
@@ -233,6 +235,8 @@ _FLOAT = ("F32",)
 _HALF_OR_FLOAT = ("F16", "F32")
 _NUMBER = ("F16", "F32", "F64")
 
+MAX_VALUES = 1 << 18
+"""Of a tensor's row: a sparse file may say that it holds terabytes."""
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R R^T - I and of the last row minus 0 0 0 1."""
 WEIGHT_TOLERANCE = {np.dtype(np.float16): 4e-3, np.dtype(np.float32): 1e-3}
@@ -302,6 +306,8 @@ def _check_tensor(
     if not fits or 0 in found[1:]:
         wanted = tuple("*" if want is None else want for want in shape)
         raise StoreError(f"{where}: expected shape {wanted}, found {found}")
+    if math.prod(found[1:]) > MAX_VALUES:
+        raise StoreError(f"{where}: expected at most {MAX_VALUES} values a sample, found {found}")
 
 
 def check_rows(
@@ -391,11 +397,8 @@ def _check_weights(where: str, array: np.ndarray, known: np.ndarray, first: int)
 
 
 def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
-    rotation = array[known][..., :3, :3].astype(np.float64)
-    product = rotation @ np.swapaxes(rotation, -1, -2)
-    off = np.abs(product - np.eye(3)).max((-1, -2))
     worst = np.zeros(len(array))
-    worst[known] = np.where(np.linalg.det(rotation) > 0, off, 2.0).max(1)
+    worst[known] = rotation_error(array[known][..., :3, :3]).max(1)
     _refuse(
         worst > ROTATION_TOLERANCE,
         where,

@@ -27,11 +27,11 @@ from scapo.registered.template import ArticulatedTemplate, Placement
 
 EDGE = 0.97  # Quantile of points that counts as the end of a body: single points say little
 OPEN = (0.1, 0.9)  # Quantiles of the views between which a part's way out of the body is measured
-FRAMES = 1500  # Rotations of the grid of frames, 13 degrees apart
+FRAMES = 1500  # Rotations of the grid of frames, about 18 degrees apart
 PICKED, SETTLED = 8.0, 12.0
 """Sharpness of exp(-k (1 - cosine)), by which normals count for the nearest direction of a frame,
 when one is picked from the grid and when it is settled among them."""
-SETTLING = 20  # Steps in which a frame settles; few change anything
+SETTLING = 20  # Steps in which a frame settles
 TOLD = 0.05  # Share of the base's normals that a direction needs to be one of its main ones
 LOST = 0.2  # Where no direction of a frame has this share, the frame is sought anew
 NEAR = 0.9  # Cosine of normals that count for it

@@ -43,15 +43,15 @@ COARSE, FINE, FINAL = 28, 96, 192
 """Points of a view for a first score of all rotations, a second of those left, and the last."""
 SLID = 48  # Points of a view, at most, that slide to their matches
 LEFT = 96  # Rotations of a pair that are scored a second time
-KEPT = 4  # Modes of a pair, and two more of those that are refined: some will come to the same pose
-SPARE = 2
-APART = 28.0  # Degrees between hypotheses that are refined: what a refinement bridges
+KEPT = 4  # Modes of a pair
+SPARE = 2  # Hypotheses refined beyond those, as some will come to the same pose
+APART = 28.0  # Degrees between hypotheses that are refined: a little more than the grid's spacing
 DISTINCT = 20.0  # Degrees within which refined hypotheses are the same mode
-CLEAR = 0.1  # Margin of a pair that has one mode only; larger than nearly all that rivals leave
+CLEAR = 0.1  # Margin of a pair that has one mode only: one that other pairs reach too
 ALONG = 0.1  # Weight of distances along the surface beside those across it
 DAMPING = 1e-4  # Share of the system's mean diagonal that is added to it
 NONE = 1e-8  # And beyond that, for pairs without a match
-CHUNK = 8  # Pairs registered at once: what keeps the work in a core's cache
+CHUNK = 8  # Pairs registered at once, each with all rotations: a matter of memory
 REPEATED, CHOSEN = 10.0, 100.0
 """Added to a score, of at most 1, where it is near one that was chosen, and where it was itself."""
 

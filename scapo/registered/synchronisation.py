@@ -24,8 +24,7 @@ ROOTS = 6  # Starts that are tried: the views with the largest margins
 BETA = 30.0  # How sharply the scores of one pair's modes share its vote
 SPREAD = 8.0
 """Of exp(-SPREAD angle^2) by which proposals support each other: half of it at 17 degrees."""
-PROPOSALS = 160
-"""Of a view, those with most votes, of which the densest is taken; the others hardly count."""
+PROPOSALS = 160  # Of a view, those with most votes, of which the densest is taken
 SWEEPS, STILL = 8, 5.0
 """Over all views at most; they end when every rotation changes by fewer degrees than this."""
 AVERAGED = 30  # Sweeps of averaging the translations

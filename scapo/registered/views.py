@@ -20,8 +20,7 @@ from scapo.geometry.points import farthest_points, gather, k_nearest
 from scapo.geometry.rigid import rotation_between
 
 FAR = 1e3  # Depth of a cell that shows background, in normalised lengths: beyond all that is tried
-CELLS = 24
-"""Of the depth image along either side: an object's 0.05, so that rows of points leave no gaps."""
+CELLS = 24  # Of the depth image along either side: about 0.05 of normalised length each
 MARGIN = 1.001  # Of the depth image about the points, so that rounding leaves none outside
 TINY = 1e-6  # Least divisor, of sides of images and sums of weights that may be 0
 LEAST_DEPTH = 1e-3

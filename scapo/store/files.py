@@ -20,6 +20,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from scapo.store.json_records import parse_json
 from scapo.store.schema import StoreError
 
 SAMPLES = "scapo-samples/1"
@@ -132,7 +133,7 @@ def read_header(path: Path | str, expected: str | None = None) -> Header:
             f"{path}: expected the metadata entry 'scapo', found {sorted(metadata) or 'none'}"
         )
     try:
-        header: object = json.loads(metadata["scapo"])
+        header: object = parse_json(metadata["scapo"])
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: expected JSON in the header, found {error}") from error
     if not isinstance(header, dict):

@@ -43,11 +43,18 @@ def parse_json(text: str | bytes) -> Any:  # noqa: ANN401
     """
     if isinstance(text, bytes):
         text = text.decode()
-    return json.loads(text, parse_constant=_no_number)
+    return json.loads(text, parse_constant=_no_number, parse_float=_finite)
 
 
 def _no_number(text: str) -> None:
     raise ValueError(f"{text}, which JSON lacks")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text:.20}, a number too large")
+    return value
 
 
 def from_json(

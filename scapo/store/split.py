@@ -7,7 +7,6 @@ is written and read by `write` and `read` (of `files`), a split through `open_sp
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -23,7 +22,9 @@ from scapo.store.files import (
     require,
     sha256_file,
 )
+from scapo.store.json_records import parse_json
 from scapo.store.manifest import Manifest, read_manifest
+from scapo.store.regular import read_regular
 from scapo.store.schema import LAYOUT, StoreError, check_samples, sample_shapes
 
 
@@ -163,7 +164,7 @@ def _is_split(folder: Path, category: str | None, split: str) -> bool:
     if not path.is_file():
         return False
     try:
-        data: object = json.loads(path.read_text(encoding="utf-8"))
+        data: object = parse_json(read_regular(path))
     except (OSError, ValueError, RecursionError):
         return folder.name == split
     if not isinstance(data, dict):

@@ -242,7 +242,7 @@ class Import:
 
     def run(self, console: Console) -> int:
         """Import it, and name what could not be used; 1 if there is any."""
-        from sim_assets.importers.sets import import_set
+        from sim_assets.importers.sets import Reading, import_set
 
         with progress_bar(console) as show:
             made = import_set(
@@ -251,7 +251,7 @@ class Import:
                 self.out,
                 points=self.points,
                 strict=self.strict,
-                progress=show,
+                reading=Reading(workers=1, progress=show),
             )
         notes = {model: "; ".join(several) for model, several in made.notes.items()}
         say_each(console, notes, label="repaired", style="yellow")

@@ -16,6 +16,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
+from scapo.text import one_line
 from sim_assets.formats.pickled import (
     ADMITTED,
     MAX_CONTENTS,
@@ -62,9 +63,11 @@ def unpickle(data: bytes, where: object, persistent: Persistent | None = None) -
     try:
         return resolve(machine.run(data))
     except UnpickleError as error:
-        raise UnpickleError(f"{where}: {error}") from error
+        raise UnpickleError(f"{where}: {one_line(error, 400)}") from error
     except (ValueError, TypeError, LookupError, struct.error, OverflowError) as error:
-        raise UnpickleError(f"{where}: expected a whole pickle, found {error}") from error
+        raise UnpickleError(
+            f"{where}: expected a whole pickle, found {one_line(error, 400)}"
+        ) from error
     except (MemoryError, RecursionError) as error:
         raise UnpickleError(f"{where}: expected a pickle of sane size, found {error!r}") from error
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from scapo.categories import Category
+from scapo.geometry.matrices import rotation_error
 from sim_assets.models.validate import AssetError, refuse
 
 OPENCV_T_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -111,8 +112,7 @@ def rigid(
     Raises:
         AssetError: A matrix is no rotation.
     """
-    gap = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max((1, 2))
-    wrong = (gap > SKEW) | (np.linalg.det(rotation) < 0)
+    wrong = rotation_error(rotation) > SKEW
     if wrong.any():
         part = int(np.argmax(wrong))
         raise refuse(path, f"a rotation of part {part} in {key!r}", f"{rotation[part].tolist()}")

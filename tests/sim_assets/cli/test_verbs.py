@@ -14,7 +14,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
 import pytest
 from rich.console import Console
 
@@ -22,15 +21,14 @@ from scapo.categories import CATEGORIES
 from scapo.store import open_split, write_bytes
 from sim_assets.__main__ import main
 from sim_assets.cli import verbs
-from sim_assets.cli.console import RateColumn, progress_bar, say, say_each, watched
 from sim_assets.cli.verbs import VERBS, Benchmark
-from sim_assets.describe.info import describe_state, histogram
 from sim_assets.generation import benchmark
 from sim_assets.generation.benchmark import pieces
 from sim_assets.importers import op_align_light
 from sim_assets.inspect.preview import draw_preview
 from tests.helpers import boxes, foreign
 from tests.helpers.foreign import light_set, write_pt
+from tests.helpers.odd_names import NAME
 
 
 def run(*arguments: object) -> int:
@@ -192,21 +190,6 @@ def test_info_tells_counts_ranges_and_damage(data, tmp_path, capsys):
     assert "DAMAGED" in capsys.readouterr().out
 
 
-def test_a_histogram_in_one_line():
-    values = np.concatenate([np.zeros(8), np.ones(4)])
-    line = histogram("name", values, "m")
-    assert line.startswith("name ")
-    assert "0 █" in line
-    assert "▄ 1 m, mean 0.3333" in line
-    assert "5 deg, mean 5" in histogram("constant", np.full(3, 5.0), "deg")
-
-
-def test_states_in_words():
-    assert describe_state(np.pi / 2, "revolute") == "90°"
-    assert describe_state(0.123, "prismatic") == "12 cm"
-    assert describe_state(float("nan"), "revolute") == "–"
-
-
 def test_preview_draws_a_png(data, tmp_path, capsys):
     out = tmp_path / "sheet.png"
     assert run("preview", data, "--out", out, "--count", 6) == 0
@@ -240,27 +223,13 @@ def test_check_says_of_each_model_what_came_of_it(tmp_path, capsys):
     assert json.loads(results.read_text())["counts"]["refused"] == 1
 
 
-HOSTILE = "a\n\x1b[2J[/x] [red]$\\frac{$\x07" + "y" * 5000
-"""A name that breaks lines, clears the screen, and is markup and a formula."""
-
-
-def test_what_files_say_is_printed_on_one_line_and_not_obeyed(capsys):
-    console = Console(width=80)
-    say(console, f"{HOSTILE}: found", label="left out", style="red")
-    say_each(console, {HOSTILE: HOSTILE}, label="repaired", style="yellow")
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2
-    assert all(line.isprintable() and len(line) < 3000 for line in lines)
-    assert lines[0].startswith(r"left out a \x1b[2J[/x] [red]$\frac{$\x07yyy")
-
-
 def test_hostile_names_in_info_and_preview(data, tmp_path, capsys):
     folder = tmp_path / "split"
     for path in (data / "laptop/train").iterdir():
         write_bytes(folder / path.name, path.read_bytes())
     manifest = json.loads((folder / "manifest.json").read_text())
-    manifest["parts"] = [HOSTILE, "$\\frac{$"]
-    manifest["versions"] = {HOSTILE: HOSTILE}
+    manifest["parts"] = [NAME, "$\\frac{$"]
+    manifest["versions"] = {NAME: NAME}
     write_bytes(folder / "manifest.json", json.dumps(manifest).encode())
     usual = run("info", data / "laptop/train"), capsys.readouterr().out.count("\n")
     assert run("info", folder) == 0
@@ -269,18 +238,6 @@ def test_hostile_names_in_info_and_preview(data, tmp_path, capsys):
     assert all(line.isprintable() and len(line) < 3000 for line in lines)
     assert run("preview", folder, "--out", tmp_path / "sheet.png", "--count", 2) == 0
     assert capsys.readouterr().out.startswith("2 samples drawn")
-
-
-def test_progress_shows_on_a_terminal_only():
-    for terminal in (True, False):
-        stream = io.StringIO()
-        console = Console(file=stream, force_terminal=terminal, width=100)
-        with progress_bar(console) as show:
-            show("samples", 0, 10)
-            show("samples", 10, 10)
-        assert list(watched(console, "assets", "ab", 2)) == ["a", "b"]
-        assert ("10/10" in stream.getvalue()) is terminal
-    assert RateColumn().max_refresh is None
 
 
 ONLY = ("sensor/scissors/val", "clean/laptop/val")

@@ -29,6 +29,7 @@ from sim_assets.generation.request import make_request, versions
 from sim_assets.inspect.view import DisplayedSample, Viewer
 from sim_assets.options import DataOptions
 from tests.helpers.browser import open_page
+from tests.helpers.odd_names import PARTS
 
 pytestmark = [
     pytest.mark.skipif(
@@ -186,26 +187,19 @@ def near(picture: np.ndarray, color: str) -> int:
     return int((np.abs(picture.astype(int) - wanted).max(-1) < 12).sum())
 
 
-HOSTILE = (
-    '<img src=x onerror="document.title=1"><script>document.title=2</script>',
-    "{document.title=3} [a](javascript:document.title=4) `$\\frac{$`",
-)
-"""Part names that are HTML, an expression of MDX, Markdown and LaTeX."""
-
-
 def test_names_from_files_are_text_in_a_browser(data: Path, tmp_path: Path):
     for path in (data / "laptop/train").iterdir():
         write_bytes(tmp_path / "data" / path.name, path.read_bytes())
     manifest = json.loads((tmp_path / "data/manifest.json").read_text())
-    manifest["parts"] = HOSTILE
+    manifest["parts"] = PARTS
     manifest["instances"][2]["id"] = odd = "<b onclick=alert()>laptop</b>"
     write_bytes(tmp_path / "data/manifest.json", json.dumps(manifest).encode())
     viewer = Viewer(tmp_path / "data", port=free_port())
     try:
         assert "<img" not in viewer.legend.content + viewer.text.content
         with open_page(viewer.url, tmp_path / "profile") as page:
-            wait_for(lambda: all(name in page.text() for name in HOSTILE))
-            assert f"{HOSTILE[1]} (deg)" in page.text()
+            wait_for(lambda: all(name in page.text() for name in PARTS))
+            assert f"{PARTS[1]} (deg)" in page.text()
             viewer.show(5)
             wait_for(lambda: f"Sample 5 of 6: {odd}" in page.text())
             assert page.evaluate("document.title") not in ("1", "2", "3", "4")
