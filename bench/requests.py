@@ -22,6 +22,7 @@ Mode = Literal["fast", "refine"]
 Precision = Literal["float32", "bfloat16", "float16"]
 """`scapo.training.precision.Precision`, likewise."""
 Geometry = Literal["se3", "opalign-compat"]
+Ambiguity = Literal["off", "on"]
 Kind = Literal["constant", "oracle-pose"]
 """The answers of `reference`."""
 
@@ -44,10 +45,13 @@ class Settings:
     """Intersection over union of labels, or of weights."""
     rotation: RotationKind = "full"
     """Rotation errors up to 180 degrees, or folded to 90."""
+    ambiguity: Ambiguity = "off"
+    """Score against the truth, or against the best of the turns that look alike where the data say
+    so (docs/ambiguity.md)."""
 
     def changes(self) -> str:
         """What differs from the defaults and changes per-sample scores, for the variant's name."""
-        names = ("geometry", "pivot", "label_order", "iou", "rotation")
+        names = ("geometry", "pivot", "label_order", "iou", "rotation", "ambiguity")
         default = Settings()
         changed = [n for n in names if getattr(self, n) != getattr(default, n)]
         return ",".join(f"{n.replace('_', '-')}={getattr(self, n)}" for n in changed)
@@ -183,8 +187,7 @@ class TrainRequest(Generic[M]):
     split: str = "train"
     """Split to train on."""
     val_split: str = "val"
-    """Split on which methods with a validation pass are validated; where the data lack it, every
-    tenth object of --split is held out for that. Others do not read it."""
+    """Split for methods with a validation pass; without it, every tenth object of --split."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, cuda:1, ..."""
     seed: int = 1

@@ -56,7 +56,7 @@ class Category:
     joints: tuple[JointSpec, ...]
     benchmark: tuple[Literal["clean", "sensor"], ...]
     symmetry: Matrix3 | None
-    """Rotation A of the object frame that exchanges the parts (CONTRACT 1), or None."""
+    """Rotation A of the object frame that exchanges the parts (docs/data-format.md), or None."""
     window: Window
     diagonal: float
     """Nominal diagonal of the box at rest in metres, for models without metric size."""

@@ -67,5 +67,8 @@ class DataOptions:
     slow). Default: the preset's, random for sim-art."""
     color: bool = False
     """Store the colour of each point."""
+    ambiguity: bool = False
+    """Store which of the 24 turns of a cube look as the object does (docs/ambiguity.md): tensors of
+    their own, the others stay as they are. For protocols joint and full."""
     states_per_view: int = 1
     """Consecutive samples that show the same object from the same camera in other states."""

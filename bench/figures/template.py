@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -30,9 +31,10 @@ from bench.figures.drawing import (
 )
 from scapo.geometry import rigid as geometry
 from scapo.method import AbstractMethod
-from scapo.paper.method import Scapo
-from scapo.registered.method import RegisteredScapo
-from scapo.registered.template import Placement
+
+if TYPE_CHECKING:
+    from scapo.paper.method import Scapo
+    from scapo.registered.method import RegisteredScapo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +51,9 @@ class TemplateShape:
 
 def template_shape(method: AbstractMethod) -> TemplateShape | None:
     """The template at the states that the method calls 0; None for a method without one."""
+    from scapo.paper.method import Scapo
+    from scapo.registered.method import RegisteredScapo
+
     with torch.no_grad():
         if isinstance(method, RegisteredScapo):
             return _registered(method)
@@ -58,6 +63,8 @@ def template_shape(method: AbstractMethod) -> TemplateShape | None:
 
 
 def _registered(method: RegisteredScapo) -> TemplateShape:
+    from scapo.registered.template import Placement
+
     template = method.template
     origin, none = template.part_centres()[0], torch.zeros_like(template.points[:1])
     at_rest = Placement.at(torch.eye(3).to(none)[None], none, template.rest[None])

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from bench.requests import Request, Settings
+from bench.scoring.ambiguity import check_alike, score_best
 from bench.scoring.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.scoring.compat_files import Canon, check_record, fit_canon, score_compat
 from bench.scoring.predictions import Header, Predictions, read_prediction_header
@@ -35,6 +36,8 @@ def evaluate(request: Request) -> dict[str, Any]:
     """
     side_file(request.out)
     header, split = open_data(request)
+    if request.settings.ambiguity == "on":
+        check_alike(split)
     with Predictions(request.predictions, split) as predictions:
         fitted = fit_frames(request, header, split, predictions)
         scored = _Scored()
@@ -67,6 +70,11 @@ class _Scored:
 
 
 def _errors(settings: Settings, fitted: Prepared, truth: Truth, rows: Rows) -> Errors:
+    if settings.ambiguity == "on":
+        single = replace(settings, ambiguity="off")
+        return score_best(
+            truth, rows, lambda *some: _errors(single, fitted, *some), fitted.frames.revolute
+        )
     errors = score(truth, rows, settings=settings, frames=fitted.frames, order=fitted.order)
     if fitted.canon is not None:
         errors |= score_compat(truth, rows, fitted.canon, fitted.frames)

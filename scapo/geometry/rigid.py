@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import cast
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -59,6 +58,8 @@ def joint_motion(
     if kind == "prismatic":
         eye = torch.eye(3, dtype=step.dtype, device=step.device).expand(*step.shape[:-1], 3, 3)
         return rigid(eye, step)
+    import roma  # loads the compiler, which a program that only reads needs not wait for
+
     rotation = roma.rotvec_to_rotmat(step)
     return rigid(rotation, pivot - (rotation @ pivot[..., None])[..., 0])
 
@@ -140,6 +141,8 @@ def skew_matrix(v: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
 
 def project_rotation(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
     """The rotation nearest to a matrix in the Frobenius norm (SVD, det = +1)."""
+    import roma  # loads the compiler, which a program that only reads needs not wait for
+
     return cast("Tensor", roma.special_procrustes(matrix))
 
 
@@ -157,4 +160,6 @@ def random_rotations(
 ) -> Float[Tensor, "{count} 3 3"]:
     """Uniform on SO(3), from normalised Gaussian quaternions, on the generator's device."""
     quaternion = torch.randn(count, 4, generator=generator, device=generator.device, dtype=dtype)
+    import roma  # loads the compiler, which a program that only reads needs not wait for
+
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))

@@ -330,12 +330,22 @@ class Preview:
     """Category to draw; default: all."""
     split: str | None = None
     """Split to draw; default: all."""
+    by_ambiguity: bool = False
+    """Draw half of them of samples that look alike under other turns, half of others, apart; for
+    data made with --ambiguity."""
 
     def run(self, console: Console) -> int:
         """Draw it."""
         from sim_assets.inspect.preview import draw_preview
 
-        drawn = draw_preview(self.path, self.out, self.count, self.category, self.split)
+        drawn = draw_preview(
+            self.path,
+            self.out,
+            self.count,
+            self.category,
+            self.split,
+            by_ambiguity=self.by_ambiguity,
+        )
         say(console, f"{drawn} samples drawn in {self.out}")
         return 0
 

@@ -105,6 +105,9 @@ def _made(manifest: Manifest) -> str:
     if isinstance(seen, dict):
         size = f"{seen['width']} x {seen['height']}"
         rows.append(("camera", f"{size}, fx {seen['fx']:.6g}, fy {seen['fy']:.6g}"))
+    alike = manifest.options.get("ambiguity")
+    if isinstance(alike, dict):
+        rows.append(("ambiguity", ", ".join(f"{k} {v:g}" for k, v in sorted(alike.items()))))
     rows += [(f"version of {name}", text) for name, text in sorted(manifest.versions.items())]
     table = _table(("option", "value"), rows)
     command = remake(manifest)
@@ -129,7 +132,8 @@ def remake(manifest: Manifest) -> str | None:
     if Intrinsics(**options["camera"]) != usual:
         flags["image_size"] = options["camera"]["width"]
     words = [f"--{name.replace('_', '-')} {value}" for name, value in flags.items()]
-    words += [f"--{name.replace('_', '-')}" for name in ("color", "any_model") if options.get(name)]
+    switches = ("color", "ambiguity", "any_model")
+    words += [f"--{name.replace('_', '-')}" for name in switches if options.get(name)]
     return f"scapo-data generate {manifest.category} --out OUT {' '.join(words)}"
 
 

@@ -104,9 +104,19 @@ def histograms(split: Split) -> list[str]:
         short = one_line(name, LONGEST_NAME)
         lines.append(histogram(f"points on {short}", share, "%"))
         lines.append(histogram(f"{short} visible", 100 * data["visible"][:, p], "%"))
+    if "ambiguity" in manifest.options:
+        lines.append(_ambiguous(split))
     per_object = np.bincount(data["instance"], minlength=len(manifest.instances))
     lines.append(f"per object {per_object.min()} to {per_object.max()} samples")
     return lines
+
+
+def _ambiguous(split: Split) -> str:
+    alike = split.arrays("alike")["alike"] == 1
+    several = alike[:, 1:].any(1)
+    turns = np.flatnonzero(alike[:, 1:].any(0)) + 1
+    which = f", turns {', '.join(map(str, turns))}" if len(turns) else ""
+    return f"ambiguous  {100 * several.mean():.1f} % of the views look alike when turned{which}"
 
 
 def _line(text: str) -> str:

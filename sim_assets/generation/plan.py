@@ -18,6 +18,7 @@ from scapo.store.manifest import Instance
 from sim_assets.generation.assets import Asset
 from sim_assets.models.account import sentences
 from sim_assets.objects import ArticulatedObject
+from sim_assets.sampling.ambiguity import CHOSEN as TOLERANCE
 from sim_assets.sampling.samples import Settings
 
 SHARD_SAMPLES = 64
@@ -46,9 +47,11 @@ class Request:
         settings = asdict(self.settings)
         camera = settings.pop("camera")
         settings.pop("held_out")  # said by the split
-        for name, usual in (("preset", "sim-art"), ("mask", "exact")):
+        for name, usual in (("preset", "sim-art"), ("mask", "exact"), ("ambiguity", False)):
             if settings[name] == usual:
                 settings.pop(name)
+        if self.settings.ambiguity:
+            settings["ambiguity"] = asdict(TOLERANCE)
         return {
             **settings,
             "camera": camera,

@@ -87,6 +87,11 @@ def _settings(options: DataOptions) -> Settings:
             f"noise and mask: expected none and exact with protocol full, which has no picture, "
             f"found {options.noise} and {options.mask}"
         )
+    if options.ambiguity:
+        if protocol == "isolated":
+            raise ValueError("ambiguity: expected protocol joint or full, found isolated")
+        if needed:
+            resolve_backend("raycast")  # turned objects are rendered by it, whatever the backend
     return Settings(
         protocol=protocol,
         backend=resolve_backend(options.backend) if needed else None,
@@ -99,6 +104,7 @@ def _settings(options: DataOptions) -> Settings:
         held_out=options.split in ("test", "test-ood"),
         noise=options.noise,
         mask=options.mask,
+        ambiguity=options.ambiguity,
     )
 
 

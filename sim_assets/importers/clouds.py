@@ -172,7 +172,7 @@ def find_files(path: Path, ending: str) -> list[Path]:
     found = [
         file
         for file in path.rglob(f"*{ending}")
-        if file.is_file() and not any(p.startswith(".") for p in file.relative_to(path).parts)
+        if not file.is_dir() and not any(p.startswith(".") for p in file.relative_to(path).parts)
     ]
     if not found:
         raise refuse(path, f"{ending} files in the folder", "none")

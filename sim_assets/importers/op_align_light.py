@@ -70,7 +70,7 @@ def _index(path: Path) -> int | None:
 
 def _file(path: Path) -> CloudFile:
     """Category, split and instance from the folders; a misplaced file has no category."""
-    parts = path.resolve().parts
+    parts = (*path.parent.resolve().parts, path.name)  # be the file itself a link to anywhere
     index = _index(path)
     nowhere = CloudFile(path=path, name=path.name, category="", split="", instance="")
     if len(parts) < 4 or index is None:

@@ -72,7 +72,7 @@ def find(path: Path) -> list[CloudFile]:
 
 def _file(path: Path) -> CloudFile:
     """Category, split and instance from the folders; a misplaced file has no category."""
-    parts = path.resolve().parts
+    parts = (*path.parent.resolve().parts, path.name)  # be the file itself a link to anywhere
     for k in range(len(parts) - 3, -1, -1):
         if parts[k] in CATEGORIES and parts[k + 1] in ("train", "test"):
             return CloudFile(

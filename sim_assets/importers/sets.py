@@ -209,9 +209,9 @@ def refuse_inside(target: Path, *sources: Path) -> None:
     Raises:
         ValueError: Naming both.
     """
-    place = target.resolve()
+    place = Path(os.path.realpath(target))
     for source in sources:
-        real = source.resolve()
+        real = Path(os.path.realpath(source))  # a link in a circle is itself
         if place == real or real in place.parents or place in real.parents:
             raise ValueError(f"{target}: expected a place outside the source, found it in {source}")
 

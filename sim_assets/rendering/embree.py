@@ -25,8 +25,12 @@ REBUILD_BELOW = 12_000
 class RaycastRenderer(AbstractRenderer):
     """Renders with Embree; see `AbstractRenderer`."""
 
-    def __init__(self, *, color: bool = False) -> None:
-        self.color = color
+    def __init__(self, *, color: bool = False, rebuild_below: int = REBUILD_BELOW) -> None:
+        """Store colours or not; objects of more triangles than `rebuild_below` are never rebuilt.
+
+        For several pictures of one object in a row, 0 is fastest.
+        """
+        self.color, self.rebuild_below = color, rebuild_below
         self.object: ArticulatedObject | None = None
 
     def open(self, thing: ArticulatedObject) -> None:
@@ -36,7 +40,7 @@ class RaycastRenderer(AbstractRenderer):
         self.vertices = [np.asarray(mesh.vertices, np.float64) for mesh in meshes]
         self.faces = [np.asarray(mesh.faces, np.int32) for mesh in meshes]
         self.paints = [Paint(visuals) for visuals in thing.visuals] if self.color else []
-        self.large = sum(len(faces) for faces in self.faces) > REBUILD_BELOW
+        self.large = sum(len(faces) for faces in self.faces) > self.rebuild_below
         self.scenes = [
             _embree(vertices, faces) if self.large else None
             for vertices, faces in zip(self.vertices, self.faces, strict=True)

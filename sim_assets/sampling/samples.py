@@ -28,6 +28,7 @@ from sim_assets.rendering.base import (
     RenderError,
     RenderRequest,
 )
+from sim_assets.sampling.ambiguity import Ambiguity
 from sim_assets.sampling.cloud import (
     FPS_POOL,
     Cloud,
@@ -95,6 +96,8 @@ class Settings:
     """A test split: eyeglasses then have a published grid of their own."""
     noise: Noise = "none"
     mask: Mask = "exact"
+    ambiguity: bool = False
+    """Say which turns look alike."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,6 +131,9 @@ class SampleMaker:
         self.enough = pool * max(settings.points, LEAST_PIXELS)
         names = [field.name for field in fields(ViewOptions)]
         self.view_options = ViewOptions(**{name: getattr(settings, name) for name in names})
+        self.ambiguity = None
+        if settings.ambiguity:
+            self.ambiguity = Ambiguity(thing, settings.camera, settings.noise, settings.protocol)
         if renderer is not None:
             renderer.open(thing)
 
@@ -221,6 +227,7 @@ class SampleMaker:
             "joint_state": known.state.astype(np.float32),
             "visible": visible.astype(np.float32),
             "camera": np.array(settings.camera.row(), np.float32),
+            **self._alike(state, known.camera_T_part[0]),
         }
 
     def _whole(
@@ -238,6 +245,12 @@ class SampleMaker:
         count, sampling = self.settings.points, self.settings.sampling
         cloud = self.surface.sample(known.camera_T_part, count, self.least, own, sampling)
         return known, cloud, np.ones(len(known.camera_T_part))
+
+    def _alike(self, state: np.ndarray, camera_T_object: np.ndarray) -> Row:
+        """The tensors of `ambiguity`, if they are asked for."""
+        if self.ambiguity is None:
+            return {}
+        return self.ambiguity.find(state, camera_T_object).row()
 
     def _enough(self, cloud: Cloud) -> bool:
         """Whether each part has the points it needs."""

@@ -18,7 +18,7 @@ from scapo import store
 from scapo.store import samples as data
 from scapo.store.files import sha256_file
 from scapo.store.samples import OPTIONAL, TENSORS, SampleDataset, label, observe, observed
-from scapo.store.schema import LAYOUT, StoreError
+from scapo.store.schema import ALIKE, LAYOUT, StoreError
 from tests.helpers.splits import POINTS, edit_manifest, sample_arrays, write_split
 
 COUNTS = (3, 1, 4)
@@ -153,7 +153,7 @@ def test_shards_are_memory_mapped(folder: Path, samples: SampleDataset) -> None:
 
 
 def test_names_choose_the_tensors(folder: Path) -> None:
-    assert set(TENSORS) == set(LAYOUT) - set(OPTIONAL)
+    assert set(TENSORS) == set(LAYOUT) - {*OPTIONAL, *ALIKE}
     assert observed(store.open_split(folder)) == TENSORS
     found = store.dataset(folder, names=("points", "part"))[0]
     assert set(found) == {"points", "part", "index"}
