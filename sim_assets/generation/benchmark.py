@@ -81,6 +81,7 @@ class Piece:
             noise="disparity" if sensor else "none",
             mask="imperfect" if sensor else "exact",
             backend=backend,
+            ambiguity=self.split in ("test", "test-ood"),
         )
 
 

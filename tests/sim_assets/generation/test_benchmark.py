@@ -75,6 +75,7 @@ def test_all_of_contract_4_is_there():
         assert (options.instances, options.count) == (instances, instances * each)
         assert (options.seed, options.points, options.backend) == (2, 1024, "sapien")
         assert (options.preset, options.noise, options.mask) == wanted[piece.part]
+        assert options.ambiguity == (piece.split in ("test", "test-ood"))
 
 
 @pytest.mark.parametrize(
