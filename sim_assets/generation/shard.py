@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The jobs that workers do: describe an object, and render a shard to its file.
 
-The views of the objects of a shard: one object after the other, or several at once.
+A shard's objects are shown one after the other, or several at once where the renderer can.
 """
 
 from __future__ import annotations
