@@ -28,6 +28,20 @@ class Visual:
     """RGBA in [0, 1]; a mesh with its own texture keeps it in `mesh.visual`."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Account:
+    """What a reader decided about a model, for its user to see."""
+
+    joints: tuple[str, ...]
+    """Per joint of the category: the model's joint, and what it moves, in the model's words."""
+    size: str
+    """Sides of the box at rest, and how its scale was chosen."""
+    names: tuple[str, ...]
+    """What the model's links are called, by its semantics where it has them."""
+    speaks: bool
+    """Whether one of its names speaks of the category."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Origin:
     """Where an object came from (the manifest's instance record, docs/data-format.md)."""
@@ -46,6 +60,8 @@ class Origin:
     """state = sign * (q - rest)."""
     repairs: tuple[str, ...] = ()
     """What the reader put right, one sentence each."""
+    account: Account | None = None
+    """Of a model that was read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,6 +79,8 @@ class ArticulatedObject:
     upper: Float[np.ndarray, " J"]
     """Travel: the state runs from 0 to here, rad or m."""
     origin: Origin
+    trait: str = ""
+    """What sets it apart from the training shapes (`test-ood`); empty where nothing does."""
 
     def pose(self, state: Float[np.ndarray, " J"]) -> Float[np.ndarray, "P 4 4"]:
         """object_T_part of every part: its parent's pose followed by the joint's motion."""

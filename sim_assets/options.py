@@ -11,7 +11,7 @@ Protocol = Literal["joint", "isolated", "full"]
 Sampling = Literal["random", "fps"]
 Noise = Literal["none", "kinect", "disparity"]
 Mask = Literal["exact", "imperfect"]
-PresetName = Literal["sim-art", "sim-art-sensor", "op-align", "eap"]
+PresetName = Literal["sim-art", "sim-art-sensor", "sim-art-complete", "op-align", "eap"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +26,8 @@ class DataOptions:
     """Axis that a model's front (door, drawer, user side) faces; default: as the source has it."""
     scale: float | None = None
     """Scale: metres per unit of the URDF; default: as the source has it."""
+    any_model: bool = False
+    """Any model: take also one none of whose links, joints or semantics speaks of the category."""
     split: SplitName = "train"
     """Split to make; splits share no instance. Models are divided by a hash of their name,
     70:10:20, where the folder has no splits of its own; fewer than ten go whole into the split
@@ -45,8 +47,9 @@ class DataOptions:
     preset: PresetName = "sim-art"
     """Preset of joint states, views and camera. sim-art: each category's travel and window, the
     object filling 50 to 90 % of the image. sim-art-sensor: the same windows, 640 x 480, a drawn
-    distance. op-align, eap: the published windows (isolated parts, farthest-point sampling, 640 x
-    480)."""
+    distance. sim-art-complete: the whole surface of what sim-art shows, in the same states and
+    places, turned by any rotation. op-align, eap: the published windows (isolated parts,
+    farthest-point sampling, 640 x 480)."""
     noise: Noise = "none"
     """Noise of the depth sensor. kinect: structured light (Nguyen et al. 2012). disparity:
     disturbed and rounded disparities (Handa et al. 2014). Both with flying pixels and holes."""

@@ -99,8 +99,8 @@ def data_name(folder: Path, split: Split) -> str:
     """`NAME@DIGEST`: what the data are called, and the first 12 digits of their digest.
 
     NAME is the manifest's option `benchmark`, else the folder above the category where that is
-    part of the data set (`clean`, `sensor`), else `sensor` for data with simulated sensor noise
-    and `clean` without.
+    part of the data set or of the benchmark (`clean`, `sensor`, `complete`, `real`), else `sensor`
+    for data with simulated sensor noise and `clean` without.
     """
     manifest, root = split.manifest, folder.resolve()
     named = manifest.options.get("benchmark")
@@ -108,7 +108,7 @@ def data_name(folder: Path, split: Split) -> str:
     inside = above != root and above.is_relative_to(root)
     if isinstance(named, str) and named:
         name = one_line(named, 100)
-    elif inside or above.name in ("clean", "sensor"):
+    elif inside or above.name in ("clean", "sensor", "complete", "real"):
         name = above.name
     else:
         noisy = manifest.options.get("noise", "none") != "none"

@@ -50,6 +50,10 @@ class Instance:
     """The URDF joint of each category joint."""
     sign: tuple[float, ...]
     """state = sign * (q - rest)."""
+    trait: str = ""
+    """What sets it apart from the training shapes, in `test-ood`; not stored where empty."""
+    account: tuple[str, ...] = ()
+    """How a model was read, one sentence each: joints, size, repairs; not stored where empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,6 +83,10 @@ class Manifest:
     def to_json(self) -> str:
         """Indented, sorted, with a final newline."""
         data = {"format": FORMAT, **asdict(self)}
+        for row in data["instances"]:
+            for name in ("trait", "account"):
+                if not row[name]:
+                    del row[name]
         if not self.left_out:
             del data["left_out"]
         return json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n"

@@ -97,6 +97,8 @@ def show_made(console: Console, made: Made, seconds: float) -> None:
     say(console, f"digest {manifest.digest}")
     say(console, f"plan   {manifest.plan_digest}")
     say(console, f"folder {made.folder}")
+    read = {i.id: "; ".join(i.account) for i in manifest.instances if i.account}
+    say_each(console, read, label="taken", style="green")
     say_each(console, made.failed, label="left out", style="red")
     lost = int(facts.get("samples_lost", 0))
     if lost:

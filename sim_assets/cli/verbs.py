@@ -82,6 +82,8 @@ class Check:
     """Axis that the front faces."""
     scale: float | None = None
     """Scale: metres per unit of the URDF."""
+    any_model: bool = False
+    """Any model: with a category, accept also those none of whose names speaks of it."""
     workers: int = os.cpu_count() or 1
     """Worker processes."""
 
@@ -92,11 +94,17 @@ class Check:
         colors = {"accepted": "green", "repaired": "yellow", "refused": "red"}
 
         def show(result: Result) -> None:
-            why = result.reason or "; ".join(result.repairs)
+            why = result.reason or "; ".join(result.account or result.repairs)
             style = colors[result.status]
             say(console, f"{result.path}  {why}", label=f"{result.status:8} ", style=style)
 
-        options = Options(category=self.category, up=self.up, front=self.front, scale=self.scale)
+        options = Options(
+            category=self.category,
+            up=self.up,
+            front=self.front,
+            scale=self.scale,
+            any_model=self.any_model,
+        )
         results = check(self.path, options, workers=self.workers, on_result=show)
         if self.json is not None:
             write_report(results, self.json)
@@ -153,13 +161,17 @@ class Benchmark:
     Started again after an interruption it goes on; the bytes are the same either way.
     """
 
-    name: tyro.conf.Positional[Literal["sim-art/1"]]
-    """Name of the benchmark: 69,000 samples of the nine categories, about 1 GB."""
+    name: tyro.conf.Positional[Literal["sim-art/2", "sim-art/1"]]
+    """Name of the benchmark: 117,000 samples of the nine categories, about 1.6 GB
+    (docs/benchmark.md). sim-art/1, its predecessor, is made by an older commit, which is named."""
     out: Path
     """Folder of the benchmark."""
     only: tuple[str, ...] = ()
-    """Only these pieces: parts (clean, sensor), categories, splits, or several joined by /, such as
-    sensor/laptop/train."""
+    """Only these pieces: parts (clean, sensor, complete, real), categories, splits, or several
+    joined by /, such as sensor/laptop/train."""
+    real: Path | None = None
+    """Real models of yours, PATH/CATEGORY/ID/*.urdf: adds OUT/real/CATEGORY/test, 20 views of each.
+    Their category is told by PATH/index.csv, by themselves, or by the folder."""
     backend: Literal["auto", "sapien", "raycast"] = "sapien"
     """Renderer; the published digests are SAPIEN's."""
     workers: int | None = None
@@ -174,10 +186,22 @@ class Benchmark:
 
     def run(self, console: Console) -> int:
         """Make them, print a summary of each split, and name the objects that failed."""
-        from sim_assets.generation.benchmark import RECORD, make_benchmark, pieces
+        from sim_assets.generation.benchmark import (
+            RECORD,
+            Task,
+            check_name,
+            find_real,
+            make_benchmark,
+            pieces,
+        )
         from sim_assets.generation.generate import Running
 
-        total, failed = len(pieces(self.only)), False
+        check_name(self.name)
+        task = Task(only=self.only, backend=self.backend, real=self.real)
+        real = find_real(task)
+        total, failed = len(pieces(self.only, real)), False
+        others = {} if real is None else real.others
+        say_each(console, others, label="no category", style="yellow")
         with progress_bar(console) as show:
             running = Running(
                 workers=self.workers,
@@ -186,7 +210,7 @@ class Benchmark:
                 strict=self.strict,
                 progress=show,
             )
-            made = make_benchmark(self.out, self.only, self.backend, running)
+            made = make_benchmark(self.out, task, running)
             for number, done in enumerate(made, 1):
                 say(console, f"{number}/{total} {done.piece.name}")
                 show_made(console, done.made, done.seconds)
@@ -241,18 +265,25 @@ class Import:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Info:
-    """Say what a data set holds, and whether its shards are whole."""
+    """Say what a data set holds, how much its objects differ, and whether its shards are whole."""
 
     path: tyro.conf.Positional[Path]
     """A data set, or a category or split of one."""
+    source: Path | None = None
+    """Source of the objects: the folder of models that the set was made from, to measure them."""
 
     def run(self, console: Console) -> int:
         """Print counts, histograms and digests of every split; 1 if a shard is damaged."""
-        from sim_assets.describe.info import describe_folder
+        from scapo.store import Split
+        from sim_assets.describe.info import describe_split, find_splits
+        from sim_assets.inspect.variation import Variation
 
-        whole = True
-        for report in describe_folder(self.path):
-            console.print(report.text, soft_wrap=True, highlight=False, markup=False)
+        whole, variation = True, Variation(self.source)
+        for folder in find_splits(self.path):
+            split = Split(folder)
+            report = describe_split(split)
+            lines = [report.text, *variation.lines(split)]
+            console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
             whole &= report.whole
         return 0 if whole else 1
 
@@ -319,6 +350,33 @@ class Preview:
         return 0
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Write a data set in a format that is read without this package.
+
+    OUT gets the same folders, with the manifest, the card and a file for each shard. It appears
+    whole, and replaces only an earlier export.
+    """
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+    format: Literal["webdataset", "parquet", "npz"]
+    """Format. webdataset: tar files with one .npy for each tensor of a sample. parquet: a row for
+    each sample (needs pyarrow: pip install 'scapo[export]'). npz: stacked arrays."""
+    out: Path
+    """Folder to write."""
+
+    def run(self, console: Console) -> int:
+        """Write it, and print what was written."""
+        from sim_assets.describe.info import find_splits
+        from sim_assets.formats.export import export
+
+        for done in export(self.path, find_splits(self.path), self.out, self.format):
+            say(console, f"{done.name}: {done.samples} samples in {done.files} files")
+        say(console, f"written to {self.out}")
+        return 0
+
+
 VERBS: dict[str, type] = {
     "doctor": Doctor,
     "build": Build,
@@ -329,5 +387,6 @@ VERBS: dict[str, type] = {
     "info": Info,
     "view": View,
     "preview": Preview,
+    "export": Export,
 }
 """In the order of the help."""

@@ -14,22 +14,12 @@ from scapo.geometry.camera import Intrinsics
 from scapo.store import Split, write_bytes
 from scapo.store.manifest import Manifest
 from scapo.text import as_markdown
+from sim_assets.describe.croissant import CROISSANT, croissant_text
 from sim_assets.describe.info import histograms
+from sim_assets.describe.terms import citation, licence, terms
 from sim_assets.sampling.presets import camera
 
 CARD = "card.md"
-_OWN_TERMS = (
-    "The objects are made by this project's own generators and show nobody's design; the data may "
-    "be used under the project's licence (MIT)."
-)
-_MODELS_TERMS = (
-    "Rendered from models in a folder of URDF files. The terms of those models apply to this data "
-    "as well; the manifest names the file and the SHA-256 of each."
-)
-_FOREIGN_TERMS = (
-    "Converted from other authors' set `{source}`. Their terms apply to this data, and their work "
-    "is to be cited; the manifest names the files and the SHA-256 of each recording."
-)
 _READ = """```python
 from scapo.store import dataset
 
@@ -39,13 +29,17 @@ samples[0]["points"]  # ({points}, 3), camera frame, metres
 
 
 def write_card(folder: Path) -> None:
-    """Write the card of the split in this folder.
+    """Write the card of the split in this folder, and its Croissant file.
 
     Raises:
         StoreError: There is no split, or a shard is broken.
         OSError: It cannot be written.
     """
-    write_bytes(folder / CARD, card(Split(folder)).encode())
+    split = Split(folder)
+    for name, text in ((CROISSANT, croissant_text(split)), (CARD, card(split))):
+        path, data = folder / name, text.encode()
+        if not path.exists() or path.read_bytes() != data:
+            write_bytes(path, data)
 
 
 def card(split: Split) -> str:
@@ -53,9 +47,11 @@ def card(split: Split) -> str:
     manifest = split.manifest
     sections = [
         as_markdown(f"# {manifest.category}, {manifest.split}"),
-        _summary(manifest),
+        _summary(split),
         "## Source and terms",
-        _terms(manifest),
+        terms(manifest),
+        "## How to cite",
+        f"```bibtex\n{citation(manifest)}\n```",
         "## How it was made",
         _made(manifest),
         "## Parts and joints",
@@ -72,8 +68,12 @@ def card(split: Split) -> str:
     return "\n\n".join(sections) + "\n"
 
 
-def _summary(manifest: Manifest) -> str:
+def _summary(split: Split) -> str:
+    manifest = split.manifest
+    size = sum((split.folder / shard.file).stat().st_size for shard in manifest.shards)
     rows = [
+        ("licence", licence(manifest)),
+        ("size", f"{size / 1e6:.1f} MB"),
         ("samples", f"{manifest.count}"),
         ("points per sample", f"{manifest.points}"),
         ("objects", f"{len(manifest.instances)}"),
@@ -94,17 +94,6 @@ def _summary(manifest: Manifest) -> str:
         if facts.get(name):
             rows.append((label, f"{facts[name]:.0f}"))
     return _table(("", ""), rows)
-
-
-def _terms(manifest: Manifest) -> str:
-    source = manifest.options.get("source")
-    if source == "procedural":
-        return _OWN_TERMS
-    return (
-        _MODELS_TERMS
-        if source == "urdf"
-        else _FOREIGN_TERMS.format(source=as_markdown(f"{source}"))
-    )
 
 
 def _made(manifest: Manifest) -> str:
@@ -130,6 +119,8 @@ def remake(manifest: Manifest) -> str | None:
     options = manifest.options
     if options.get("source") not in ("procedural", "urdf") or "camera" not in options:
         return None
+    if "chosen_by" in options:
+        return f"scapo-data {options['chosen_by']} FOLDER --only real/{manifest.category} --out OUT"
     source = "FOLDER" if options["source"] == "urdf" else "procedural"
     flags = {"source": source, "split": manifest.split, "count": manifest.count}
     if manifest.statistics.get("samples_lost"):
@@ -141,7 +132,8 @@ def remake(manifest: Manifest) -> str | None:
     if Intrinsics(**options["camera"]) != usual:
         flags["image_size"] = options["camera"]["width"]
     words = [f"--{name.replace('_', '-')} {value}" for name, value in flags.items()]
-    words += [f"--{name}" for name in ("color", "ambiguity") if options.get(name)]
+    switches = ("color", "ambiguity", "any_model")
+    words += [f"--{name.replace('_', '-')}" for name in switches if options.get(name)]
     return f"scapo-data generate {manifest.category} --out OUT {' '.join(words)}"
 
 

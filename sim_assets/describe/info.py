@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,16 +42,6 @@ def find_splits(path: Path) -> list[Path]:
     return found
 
 
-def describe_folder(path: Path) -> Iterator[Report]:
-    """A report for each split at `path` or below it.
-
-    Raises:
-        StoreError: There is no data set, or a manifest is broken.
-    """
-    for folder in find_splits(path):
-        yield describe_split(Split(folder))
-
-
 def describe_split(split: Split) -> Report:
     """The report of one split; its shards are read, and compared with their hashes."""
     manifest = split.manifest
@@ -78,6 +68,9 @@ def _facts(manifest: Manifest) -> list[str]:
         f"digest     {manifest.digest}",
         f"plan       {manifest.plan_digest}",
     ]
+    traits = Counter(instance.trait for instance in manifest.instances if instance.trait)
+    if traits:
+        lines.append("  traits     " + ", ".join(f"{n} {name}" for name, n in traits.items()))
     facts = manifest.statistics
     if "redrawn_share" in facts:
         lines.append(f"redrawn    {100 * facts['redrawn_share']:.2f} % of the views drawn")

@@ -99,7 +99,7 @@ def make_split(
     if options.source != "procedural":  # workers elsewhere stand in another folder
         options = replace(options, source=str(Path(options.source).absolute()))
     request, assets = make_request(category, options)
-    found = versions(request.settings.backend, request.settings.protocol)
+    found = versions(request.settings.backend)
     return generate(request, assets, out / category / options.split, found, running)
 
 

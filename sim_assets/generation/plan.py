@@ -16,6 +16,7 @@ from typing import Any
 from scapo.store import canonical_json
 from scapo.store.manifest import Instance
 from sim_assets.generation.assets import Asset
+from sim_assets.models.account import sentences
 from sim_assets.objects import ArticulatedObject
 from sim_assets.sampling.ambiguity import CHOSEN as TOLERANCE
 from sim_assets.sampling.samples import Settings
@@ -157,6 +158,8 @@ def instance_record(thing: ArticulatedObject) -> Instance:
         rest=dict(origin.rest),
         joint_names=origin.joint_names,
         sign=origin.sign,
+        trait=thing.trait,
+        account=sentences(thing),
     )
 
 

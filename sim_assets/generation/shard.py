@@ -203,7 +203,7 @@ def render_shard_alike(job: ShardJob, report: Report) -> ShardDone:
         ValueError: What makes the pixels here has other versions than where the data set was begun.
     """
     settings = job.request.settings
-    found = _versions(settings.backend, settings.protocol)
+    found = _versions(settings.backend)
     if found != job.versions:
         names = sorted(n for n in {*found, *job.versions} if found.get(n) != job.versions.get(n))
         expected, there = (

@@ -32,6 +32,7 @@ from scapo.store.manifest import (
 )
 from scapo.text import one_line
 from sim_assets.describe.card import CARD, write_card
+from sim_assets.describe.croissant import CROISSANT
 from sim_assets.formats.archives import read_bytes
 from sim_assets.importers.clouds import CloudFile, RawCloud
 from sim_assets.models.limits import bounded
@@ -175,7 +176,7 @@ def made_from(set_name: str, folder: Path) -> bool:
         manifest = read_manifest(folder / "manifest.json")
     except ManifestError:
         return False
-    own = {"manifest.json", CARD, *(shard.file for shard in manifest.shards)}
+    own = {"manifest.json", CARD, CROISSANT, *(shard.file for shard in manifest.shards)}
     alone = all(path.name in own and not path.is_symlink() for path in folder.iterdir())
     return alone and manifest.options.get("source") == set_name
 

@@ -20,6 +20,7 @@ from scapo.parallel.pool import Outcome, Pool, Report
 from scapo.store.files import write_bytes
 from scapo.text import one_line
 from sim_assets.generation.request import make_request
+from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.joints import Candidate, candidates
 from sim_assets.models.library import find, source_root
 from sim_assets.models.limits import bounded, limited_memory
@@ -44,6 +45,8 @@ class Options:
     up: str | None = None
     front: str | None = None
     scale: float | None = None
+    any_model: bool = False
+    """Whether a model none of whose names speaks of the category is accepted."""
     timeout: float = 120.0
     """Seconds for one model."""
     memory: int = 4 << 30
@@ -62,6 +65,8 @@ class Result:
     repairs: tuple[str, ...] = ()
     joints: tuple[str, ...] = ()
     """Joints that a category can use; with a category given, those chosen."""
+    account: tuple[str, ...] = ()
+    """With a category given: which joints were taken, what the size is, and the repairs."""
     triangles: int = 0
 
 
@@ -152,6 +157,7 @@ def _result(outcome: Outcome[_Model, Result]) -> Result:
 def check_one(urdf: Path, root: Path, options: Options) -> Result:
     """Check one model in this process; refusals are results, other errors are raised."""
     repairs = Repairs()
+    told: tuple[str, ...] = ()
     try:
         if options.category is None:
             joints, triangles = _general(urdf, root, repairs)
@@ -165,14 +171,24 @@ def check_one(urdf: Path, root: Path, options: Options) -> Result:
                 scale=options.scale,
                 root=root,
             )
+            if not options.any_model:
+                check_speaks(urdf, thing)
             show(urdf, thing)
+            told = sentences(thing)
             joints, said = thing.origin.joint_names, thing.origin.repairs
             triangles = sum(len(visual.mesh.faces) for part in thing.visuals for visual in part)
     except AssetError as error:
         reason, said = str(error), repairs.sentences()
         return Result(path=str(urdf), status="refused", reason=reason, repairs=said)
     status: Status = "repaired" if said else "accepted"
-    return Result(path=str(urdf), status=status, repairs=said, joints=joints, triangles=triangles)
+    return Result(
+        path=str(urdf),
+        status=status,
+        repairs=said,
+        joints=joints,
+        account=told,
+        triangles=triangles,
+    )
 
 
 def show(urdf: Path, thing: ArticulatedObject) -> None:

@@ -22,6 +22,7 @@ from trimesh.visual import TextureVisuals
 from scapo.categories import Category
 from scapo.categories import category as find_category
 from sim_assets.models import frames
+from sim_assets.models.account import account
 from sim_assets.models.frames import Vector
 from sim_assets.models.joints import (
     Reduction,
@@ -41,7 +42,7 @@ from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.robot import Robot
 from sim_assets.models.sources import Traits, traits
 from sim_assets.models.validate import Repairs, check_object, check_poses, check_robot, refuse
-from sim_assets.objects import ArticulatedObject, Origin, Visual
+from sim_assets.objects import Account, ArticulatedObject, Origin, Visual
 
 __all__ = ["find", "instance_id", "read", "select"]
 
@@ -276,8 +277,18 @@ def _object(
             joint_names=tuple(joint.name for joint in joints),
             sign=tuple(rest.direction for rest in resting.rests),
             repairs=files.repairs.sentences(),
+            account=_told(resting, category, visuals, ratio),
         ),
     )
+
+
+def _told(
+    resting: _Resting, category: Category, parts: tuple[tuple[Visual, ...], ...], ratio: float
+) -> Account:
+    bounds = np.concatenate([visual.mesh.bounds for part in parts for visual in part])
+    sides = bounds.max(0) - bounds.min(0)
+    model = resting.model
+    return account(model.robot, model.known, resting.reduction, category, sides, ratio)
 
 
 def _moved(visual: Visual, a_T_b: Pose) -> Visual:

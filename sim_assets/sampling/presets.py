@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The presets of `--preset`: camera, joint states and views of our benchmark and of published data.
 
-`sim-art` and `sim-art-sensor` are the two parts of the benchmark (docs/benchmark.md).
+`sim-art` and those named after it are the parts of the benchmark (docs/benchmark.md).
 `op-align` and `eap` have the articulation windows and view grids of the published data generators
 (docs/protocol.md). What those leave open is decided here and said at the place.
 """
@@ -88,6 +88,9 @@ class Preset:
     sampling: Sampling = "random"
     distance: bool = False
     """The camera's distance is drawn, not the object's size in the image."""
+    paired: bool = False
+    """Whole surfaces in the states and places of the views that `sim-art` keeps: each sample is
+    that of `sim-art` with the same number, turned by a rotation uniform over all."""
     published: Published | None = None
     """None: states and views of the category (`scapo.categories`)."""
 
@@ -143,6 +146,9 @@ PRESETS: dict[PresetName, Preset] = {
     "sim-art": Preset(camera=Intrinsics.from_fov(radians(60), 256, 256)),
     "sim-art-sensor": Preset(
         camera=Intrinsics(fx=600, fy=600, cx=320, cy=240, width=640, height=480), distance=True
+    ),
+    "sim-art-complete": Preset(
+        camera=Intrinsics.from_fov(radians(60), 256, 256), protocol="full", paired=True
     ),
     "op-align": Preset(
         camera=_PUBLISHED_CAMERA, protocol="isolated", sampling="fps", published=OP_ALIGN

@@ -33,12 +33,20 @@ from sim_assets.sampling.cloud import (
     FPS_POOL,
     Cloud,
     SurfaceSamples,
+    Truth,
     sample_frames,
     truth,
     visible_pixels,
 )
-from sim_assets.sampling.presets import least_points
-from sim_assets.sampling.viewpoints import Outline, View, ViewOptions, draw_preset_views, generator
+from sim_assets.sampling.presets import find_preset, least_points
+from sim_assets.sampling.viewpoints import (
+    Outline,
+    View,
+    ViewOptions,
+    draw_preset_views,
+    generator,
+    rotation,
+)
 from sim_assets.sensors.depth_camera import Sensor, measure_some
 
 Row = dict[str, np.ndarray]
@@ -76,7 +84,7 @@ class Settings:
     """joint: the whole object in one picture. isolated: a picture of each part alone, merged.
     full: points of the whole surface."""
     backend: Backend | None
-    """None for `full`, which needs no pictures."""
+    """None where no pictures are needed, as for `full`."""
     camera: Intrinsics
     points: int
     sampling: Sampling
@@ -117,6 +125,7 @@ class SampleMaker:
         parts = len(thing.visuals)
         self.least = min(LEAST_POINTS, max(1, settings.points // (4 * parts)))
         self.preset_least = least_points(settings.preset, settings.protocol, parts, settings.points)
+        self.paired = find_preset(settings.preset).paired
         self.sensor = Sensor(noise=settings.noise, mask=settings.mask)
         pool = FPS_POOL if settings.sampling == "fps" else SENSED
         self.enough = pool * max(settings.points, LEAST_PIXELS)
@@ -191,7 +200,7 @@ class SampleMaker:
     def _row(self, state: np.ndarray, view: View, rng: np.random.Generator) -> Steps[Row | None]:
         settings = self.settings
         known = truth(self.thing, state, view.camera_T_object)
-        if settings.protocol == "full":
+        if settings.protocol == "full" and not self.paired:
             visible = np.ones(len(known.camera_T_part))
             cloud = self.surface.sample(
                 known.camera_T_part, settings.points, self.least, rng, settings.sampling
@@ -208,6 +217,8 @@ class SampleMaker:
             visible = self.surface.visible(frames, settings.camera, known.camera_T_part)
         if not self._enough(cloud):
             return None
+        if self.paired:
+            known, cloud, visible = self._whole(state, view, rng)
         return {
             **_cloud_row(cloud, settings.color),
             "camera_T_part": known.camera_T_part.astype(np.float32),
@@ -216,14 +227,30 @@ class SampleMaker:
             "joint_state": known.state.astype(np.float32),
             "visible": visible.astype(np.float32),
             "camera": np.array(settings.camera.row(), np.float32),
-            **self._alike(state, view),
+            **self._alike(state, known.camera_T_part[0]),
         }
 
-    def _alike(self, state: np.ndarray, view: View) -> Row:
+    def _whole(
+        self, state: np.ndarray, view: View, rng: np.random.Generator
+    ) -> tuple[Truth, Cloud, np.ndarray]:
+        """The whole surface where a good view shows it, turned about the object's origin.
+
+        From a generator of its own, which leaves the view's as it would be without: what is redrawn
+        is what `sim-art` redraws.
+        """
+        (own,) = rng.spawn(1)
+        pose = view.camera_T_object.copy()
+        pose[:3, :3] = rotation(None, own)
+        known = truth(self.thing, state, pose)
+        count, sampling = self.settings.points, self.settings.sampling
+        cloud = self.surface.sample(known.camera_T_part, count, self.least, own, sampling)
+        return known, cloud, np.ones(len(known.camera_T_part))
+
+    def _alike(self, state: np.ndarray, camera_T_object: np.ndarray) -> Row:
         """The tensors of `ambiguity`, if they are asked for."""
         if self.ambiguity is None:
             return {}
-        return self.ambiguity.find(state, view.camera_T_object).row()
+        return self.ambiguity.find(state, camera_T_object).row()
 
     def _enough(self, cloud: Cloud) -> bool:
         """Whether each part has the points it needs."""
@@ -241,7 +268,7 @@ class SampleMaker:
                 camera=self.settings.camera,
                 only=only,
             )
-            for only in ((None,) if self.settings.protocol == "joint" else parts)
+            for only in (parts if self.settings.protocol == "isolated" else (None,))
         ]
 
 

@@ -33,7 +33,7 @@ def sweep(category: str, capacities: tuple[int, ...] = ()) -> Iterator[dict[str,
     options = DataOptions(count=10**6, instances=OBJECTS, backend="maniskill")
     request, assets = make_request(category, options)
     makers = [SampleMaker(None, asset.load(), request.settings) for asset in assets]
-    device = versions("maniskill", "joint")["device"]
+    device = versions("maniskill")["device"]
     _rates(makers[:1], 1, 1, request.key)  # shaders are compiled
     for number in capacities or CAPACITIES[cuda]:
         used = makers[: min(OBJECTS, number)]

@@ -207,6 +207,7 @@ def test_names_of_data(tmp_path):
         ("noisy", {"noise": "disparity"}, "noisy", "sensor"),
         ("set/sensor", {}, "set", "sensor"),
         ("set/clean", {}, "set/clean", "clean"),
+        ("set/complete", {}, "set/complete", "complete"),
         ("named", {"benchmark": "sim-art/1/sensor"}, "named", "sim-art/1/sensor"),
     ):
         split = made.make_data(tmp_path / folder, "laptop", count=3, train=3, options=options)

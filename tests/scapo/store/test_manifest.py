@@ -95,9 +95,26 @@ def test_a_missing_field_is_refused(folder: Path, name: str) -> None:
 def test_a_missing_field_of_a_row_is_refused(folder: Path, rows: str, record: type) -> None:
     data = json.loads((folder / "manifest.json").read_text())
     for field in fields(record):
+        if field.default is not MISSING:
+            continue
         row = {name: value for name, value in data[rows][1].items() if name != field.name}
         edit_manifest(folder, **{rows: [data[rows][0], row, *data[rows][2:]]})
         refuse(folder, f"{rows}[1]: expected field {field.name!r}, found none")
+
+
+def test_trait_and_account_are_kept_and_are_not_written_where_there_are_none(folder: Path) -> None:
+    path = folder / "manifest.json"
+    before = path.read_text()
+    manifest = read_manifest(path)
+    assert {(row.trait, row.account) for row in manifest.instances} == {("", ())}
+    assert manifest.to_json() == before
+    assert "trait" not in before
+    assert "account" not in before
+    told = replace(manifest.instances[0], trait="set back", account=("joint a (door)", "size 1 m"))
+    changed = replace(manifest, instances=(told, *manifest.instances[1:]))
+    path.write_text(changed.to_json())
+    assert read_manifest(path) == changed
+    assert json.loads(path.read_text())["instances"][0]["trait"] == "set back"
 
 
 @pytest.mark.parametrize(

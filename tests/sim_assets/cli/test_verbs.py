@@ -257,7 +257,7 @@ def test_pieces_are_counted_and_the_record_named(
     console: Console, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmark, "SIZES", dict.fromkeys(benchmark.SIZES, (1, 2)))
-    verb = Benchmark(name="sim-art/1", out=tmp_path, only=ONLY, backend="raycast", workers=0)
+    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", workers=0)
     assert verb.run(console) == 0
     text = printed(console)
     names = [piece.name for piece in pieces(ONLY)]
@@ -275,13 +275,13 @@ def test_a_failed_object_ends_in_1_after_all_pieces(
 
     def failing(*arguments: object) -> Iterator[object]:
         for done in make(*arguments):  # type: ignore[arg-type]
-            yield replace(done, made=replace(done.made, failed={"scissors-val-1-00000": "died"}))
+            yield replace(done, made=replace(done.made, failed={"scissors-val-2-00000": "died"}))
 
     monkeypatch.setattr(benchmark, "make_benchmark", failing)
-    verb = Benchmark(name="sim-art/1", out=tmp_path, only=ONLY, backend="raycast", workers=0)
+    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", workers=0)
     assert verb.run(console) == 1
     assert "2/2" in printed(console)
-    assert "scissors-val-1-00000" in printed(console)
+    assert "scissors-val-2-00000" in printed(console)
 
 
 def test_the_command_names_what_it_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -22,7 +22,7 @@ def make(folder: Path, category: str = "eyeglasses", **given) -> Split:
         **{"protocol": "full", "points": 128, "count": 8, "instances": 2, "seed": 3, **given}
     )
     request, assets = make_request(category, options)
-    found = versions(request.settings.backend, request.settings.protocol)
+    found = versions(request.settings.backend)
     generate(request, assets, folder, found, Running(workers=0))
     return Split(folder)
 

@@ -80,7 +80,7 @@ def test_workers_do_not_change_the_bytes_and_streaming_gives_the_same(tmp_path):
     made: list[Made] = []
     for workers in (0, 2):
         folder = tmp_path / str(workers) / "laptop" / "train"
-        found = versions(request.settings.backend, "joint")
+        found = versions(request.settings.backend)
         made.append(generate(request, assets, folder, found, Running(workers=workers)))
     assert content(made[0].folder) == content(made[1].folder)
     split = open_split(tmp_path / "0", "laptop", "train")
@@ -107,7 +107,7 @@ def check_plan_digest_of_the_other_backend(made: Made, tmp_path: Path) -> None:
     """Ray casting another number of points plans the same objects, states and cameras."""
     options = DataOptions(count=36, instances=4, points=64, image_size=128, backend="raycast")
     request, assets = make_request("laptop", options)
-    other = generate(request, assets, tmp_path / "cast", versions("raycast", "joint"), HERE)
+    other = generate(request, assets, tmp_path / "cast", versions("raycast"), HERE)
     assert other.manifest.plan_digest == made.manifest.plan_digest
     assert other.manifest.digest != made.manifest.digest
 
@@ -189,6 +189,7 @@ def test_objects_that_die_hang_or_fail_cost_themselves_only(tmp_path):
     assert np.unique(split.arrays("instance")["instance"]).tolist() == [0, 4]
     assert {path.name for path in folder.iterdir()} == {
         "card.md",
+        "croissant.json",
         "manifest.json",
         *(shard.file for shard in split.manifest.shards),
     }
@@ -283,7 +284,7 @@ def test_interrupted_then_killed_then_finished_gives_the_same_bytes(tmp_path, re
     """Ctrl-C after the first shard, kill -9 after the third, then to the end."""
     options = DataOptions(protocol="full", points=512, count=600, instances=30)
     request, assets = make_request("laptop", options)
-    found = versions(request.settings.backend, "full")
+    found = versions(request.settings.backend)
     whole = generate(request, assets, tmp_path / "whole", found, HERE)
     folder = tmp_path / "laptop/train"
     process, errors = stop(tmp_path, repository, 1, signal.SIGINT)

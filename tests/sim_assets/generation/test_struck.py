@@ -36,7 +36,7 @@ TIMEOUT = 20.0
 
 def make(folder: Path, pool: Pool[Any, Any]) -> Made:
     request, assets = make_request("laptop", OPTIONS)
-    found = versions(request.settings.backend, request.settings.protocol)
+    found = versions(request.settings.backend)
     return generate(request, assets, folder, found, Running(), pool)
 
 

@@ -43,7 +43,7 @@ def make(folder: Path, category: str, **options) -> Path:
     given = DataOptions(protocol="full", count=6, instances=3, **{"points": 512, **options})
     request, assets = make_request(category, given)
     place = folder / category / "train"
-    generate(request, assets, place, versions(request.settings.backend, "full"), Running(workers=0))
+    generate(request, assets, place, versions(request.settings.backend), Running(workers=0))
     return place
 
 

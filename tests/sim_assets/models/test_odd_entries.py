@@ -12,6 +12,7 @@ from sim_assets.generation.assets import folder_assets
 from sim_assets.inspect.check import check
 from sim_assets.models.library import MAX_ID, find, instance_id, select
 from sim_assets.models.validate import AssetError, read_number, refuse
+from sim_assets.options import DataOptions, SplitName
 from tests.helpers.urdfs import cabinet
 
 LONG = "n" * 250
@@ -57,8 +58,10 @@ def test_they_have_names_of_their_own(odd: Path):
     assert all(len(name) <= MAX_ID and name.isascii() for name in names)
     assert instance_id(odd / "good/cabinet.urdf", odd) == "good"
     assert sum(len(select(found, split, odd)) for split in ("train", "val", "test")) == 10
-    for split in ("train", "val", "test"):
-        for asset in folder_assets(odd, "oven", split):
+    splits: tuple[SplitName, ...] = ("train", "val", "test")
+    for split in splits:
+        options = DataOptions(source=str(odd), split=split)
+        for asset in folder_assets("oven", options):
             if asset.name not in ("good", "other", "inside") and not asset.name.startswith("nnn"):
                 with pytest.raises(AssetError, match="expected"):
                     asset.load()

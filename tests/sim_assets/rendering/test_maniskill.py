@@ -111,7 +111,7 @@ def test_samples_are_those_of_sapien(category: str, given: dict, tmp_path: Path)
     for backend in ("sapien", "maniskill"):
         asked = DataOptions(count=24, instances=3, image_size=192, **given, backend=backend)
         request, assets = make_request(category, asked)
-        found = versions(request.settings.backend, request.settings.protocol)
+        found = versions(request.settings.backend)
         generate(request, assets, tmp_path / backend, found, Running(workers=0))
         splits[backend] = Split(tmp_path / backend)
     ours, theirs = splits["maniskill"], splits["sapien"]
