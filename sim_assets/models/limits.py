@@ -22,7 +22,7 @@ try:
 except ImportError:  # Windows
     resource = None
 
-READ_MEMORY = 5 << 28
+READ_MEMORY = 1 << 30
 """Bytes that reading one asset may take beyond what the process has."""
 READ_SECONDS = 20.0
 """Processor seconds that reading one asset may take: not the clock's, so that a busy machine
