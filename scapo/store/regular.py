@@ -26,8 +26,9 @@ def read_regular(path: Path, limit: int = MAX_BYTES) -> bytes:
     try:
         found = os.fstat(handle)
         if not stat.S_ISREG(found.st_mode):
-            words = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
-            raise OSError(errno.EINVAL, words, str(path))
+            if stat.S_ISDIR(found.st_mode):
+                raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+            raise OSError(errno.EINVAL, "a pipe, a socket or a device", str(path))
         if found.st_size > limit:
             words = f"{found.st_size} bytes, more than {limit}"
             raise OSError(errno.EFBIG, words, str(path))

@@ -38,7 +38,7 @@ def test_lengths_are_in_metres_and_in_units_of_the_cloud(truth: Truth):
     rows = told(truth)
     rows["camera_T_part"][:, 1, 0, 3] += 0.02
     errors = score(truth, rows, settings=Settings(), frames=FRAMES)
-    metres = np.tile([0.0, 0.02], (6, 1))
+    metres = np.tile([0.0, 0.02], (len(truth), 1))
     np.testing.assert_allclose(errors["part_translation", "m"], metres, atol=1e-7)
     np.testing.assert_allclose(errors["part_translation", "r4"], metres / truth.scale[:, None],
                                atol=1e-6)  # fmt: skip
@@ -64,5 +64,6 @@ def test_an_axis_that_points_the_other_way_turns_the_state(truth: Truth):
 
 
 def test_reconstruction_needs_poses(truth: Truth):
-    rows = {"part": told(truth)["part"], "canonical_points": np.zeros((6, 4, 3), np.float32)}
+    shape = np.zeros((len(truth), 4, 3), np.float32)
+    rows = {"part": told(truth)["part"], "canonical_points": shape}
     assert np.isnan(reconstruction(truth, rows)).all()
