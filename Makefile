@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export LP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup vulkan demo test test-quick lint format bench lock dist clean
+.PHONY: help setup vulkan demo test test-quick fuzz lint format bench lock dist clean
 
 help: ## these lines
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -36,6 +36,9 @@ lint: setup ## ruff, pyright, import contracts
 	@$(BIN)/ruff format --check .
 	@$(BIN)/lint-imports --no-logo
 	@$(BIN)/pyright --warnings
+
+fuzz: setup ## damaged files of every format for an hour (ARGS="--seconds 600 --only URDF")
+	@$(BIN)/python -m tests.fuzz --seconds 3600 $(ARGS)
 
 format: setup ## ruff, writing
 	@$(BIN)/ruff check --fix .

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """`scapo-bench` = `python -m bench`: train, predict, score and tabulate.
 
-A verb is a frozen dataclass in `bench.cli` whose fields are the flags, with a method
-`run(console)`; `VERBS` lists them. Ends 0 on success, 1 on bad input or a failed job with one
-line, 2 on wrong usage, 130 when interrupted.
+A verb is a frozen dataclass in `bench.cli.verbs` whose fields are the flags, with a method
+`run(console)`. Ends 0 on success, 1 on bad input or a failed job with one line, 2 on wrong usage,
+130 when interrupted.
 """
 
 from __future__ import annotations
@@ -11,22 +11,26 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
 from rich.logging import RichHandler
-from rich.markup import escape
 
-from bench.cli.verbs import VERBS
-from bench.runs.predict import Predict
-from bench.runs.train import prepare, train_verb
+from bench.cli.console import say
+from bench.cli.verbs import VERBS, prepare, train_verb
 
-DESCRIPTION = "Train, predict, score and tabulate methods of articulated pose estimation."
+DESCRIPTION = (
+    "Train, predict, score and tabulate methods of articulated pose estimation "
+    "(--version: of which release)."
+)
 
 
-def _commands(preset: str | None) -> Any:  # noqa: ANN401 - a union made at run time
-    verbs = {"train": train_verb(preset), "predict": Predict, **VERBS}
+def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 - made at run time
+    verbs = dict(VERBS)
+    if "train" in words:  # its methods, whose flags are the next level, take seconds to import
+        verbs["train"] = train_verb(preset)
     commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in verbs.items()]
     return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
 
@@ -34,8 +38,11 @@ def _commands(preset: str | None) -> Any:  # noqa: ANN401 - a union made at run 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and end the process."""
     words, preset = prepare(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        say(Console(), f"scapo-bench {version('scapo')}")
+        sys.exit(0)
     command: Any = tyro.cli(
-        _commands(preset),
+        _commands(words[:1], preset),
         prog="scapo-bench",
         description=DESCRIPTION,
         args=words,
@@ -45,23 +52,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
             tyro.conf.FlagCreatePairsOff,
         ),
     )
-    console = Console()
+    console, errors = Console(), Console(stderr=True)
     logging.basicConfig(
         format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )
     try:
         command.run(console)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
-        complain(" ".join(str(error).split()))
+        say(errors, f"scapo-bench: {error}")
         sys.exit(1)
     except KeyboardInterrupt as stop:
-        complain(str(stop) or "interrupted")
+        say(errors, f"scapo-bench: {stop or 'interrupted'}")
         sys.exit(130)
-
-
-def complain(line: str) -> None:
-    """One line on standard error."""
-    Console(stderr=True, soft_wrap=True).print(f"scapo-bench: {escape(line)}", highlight=False)
 
 
 if __name__ == "__main__":

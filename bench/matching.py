@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Truth by predicted slot, and the frames that predicted poses refer to.
+"""Which true part is compared with which predicted one, and the frames that predicted poses have.
 
-The order of the parts is chosen by labels alone (`ordering`), the canonical frame of a method
-that saw no poses is fitted on its predictions of the training split (PROTOCOL 1.6). Both are the
-same for every method. Truth is relabelled in a copy, never in place.
-
-Labels of points, how they overlap, and the order of parts chosen from them (PROTOCOL 1.2).
+The order of the parts is chosen by labels alone; the canonical frame of a method that saw no poses
+is fitted on its predictions of the training split. Both are the same for every method
+(docs/protocol.md). Truth is relabelled in a copy, never in place.
 """
 
 from __future__ import annotations
@@ -20,74 +18,30 @@ from jaxtyping import Bool, Float, Int, Num
 LabelOrder = Literal["sample", "dataset", "hungarian"]
 
 
+DRAWS = 100
+"""Random draws of the consensus search, each of `DRAW_SIZE` samples and each of one sample."""
+
+
+DRAW_SIZE = 5
+
+
+ROTATION_INLIER = 10.0
+"""Degrees."""
+
+
+TRANSLATION_INLIER = 0.25
+"""In the unit of the fit: 4 x mean radius for the benchmark."""
+
+
 def part_orders(parts: int) -> np.ndarray:
     """The orders tried by rule, (O, P), identity first: `order[p]` is the true part of slot p.
 
     Two parts: identity and swap. More: the base stays, so three parts have identity and the swap
-    of parts 1 and 2 (PROTOCOL 1.2).
+    of parts 1 and 2 (docs/protocol.md).
     """
     if parts == 2:
         return np.array([[0, 1], [1, 0]])
     return np.array([(0, *rest) for rest in permutations(range(1, parts))])
-
-
-def hard_labels(part: Num[np.ndarray, "B N *P"]) -> Int[np.ndarray, "B N"]:
-    """Labels of weights (B, N, P) by argmax, ties to the lower index; labels (B, N) unchanged.
-
-    A point whose weights are not all numbers is -1: it has no answer.
-    """
-    if part.ndim == 2:
-        return part.astype(np.int64, copy=False)
-    part = part.astype(np.float32, copy=False) if part.dtype == np.float16 else part
-    best = part[..., 0]
-    label = np.zeros(best.shape, np.int64)
-    undefined = np.isnan(best)
-    for index in range(1, part.shape[-1]):  # argmax over a short last axis is slow in numpy
-        larger = part[..., index] > best
-        label[larger] = index
-        best = np.where(larger, part[..., index], best)
-        undefined |= np.isnan(part[..., index])
-    label[undefined] = -1
-    return label
-
-
-def confusion(
-    part_true: Int[np.ndarray, "B N"], label: Int[np.ndarray, "B N"], parts: int
-) -> Int[np.ndarray, "B P P"]:
-    """Points of true part t in predicted slot q, (B, P, P), and answers outside 0..P-1 dropped.
-
-    Points with a negative true label are ignored.
-    """
-    batch = np.arange(len(part_true))[:, None] * parts
-    inside = (part_true >= 0) & (part_true < parts) & (label >= 0) & (label < parts)
-    index = ((batch + part_true) * parts + label)[inside]
-    counts = np.bincount(index, minlength=len(part_true) * parts * parts)
-    return counts.reshape(-1, parts, parts)
-
-
-def soft_confusion(
-    part_true: Int[np.ndarray, "B N"], weight: Num[np.ndarray, "B N P"]
-) -> Float[np.ndarray, "B P P"]:
-    """Predicted weight of slot q on the points of true part t, (B, P, P); NaN counts nothing."""
-    slots = weight.shape[-1]
-    weight = np.nan_to_num(weight.astype(np.float64))
-    rows = [np.einsum("bn,bnq->bq", part_true == part, weight) for part in range(slots)]
-    return np.stack(rows, 1)
-
-
-def as_weights(label: Int[np.ndarray, "B N"], parts: int) -> Float[np.ndarray, "B N P"]:
-    """One-hot weights; labels outside 0..P-1 have none."""
-    return (label[..., None] == np.arange(parts)).astype(np.float64)
-
-
-def overlap(
-    shared: Num[np.ndarray, "B P P"],
-    true_count: Num[np.ndarray, "B P"],
-    slot_count: Num[np.ndarray, "B P"],
-) -> Float[np.ndarray, "B P P"]:
-    """IoU of true part t and slot q from their intersection and sizes; 0/0 is NaN."""
-    union = true_count[:, :, None] + slot_count[:, None, :] - shared
-    return np.divide(shared, union, out=np.full(shared.shape, np.nan), where=union > 0)
 
 
 def choose_order(
@@ -126,14 +80,63 @@ def accuracies(
     return order_scores(counts, orders) / np.maximum(counts.sum((1, 2)), 1)[:, None]
 
 
-def joint_order(order: Int[np.ndarray, "B P"]) -> Int[np.ndarray, "B J"]:
-    """The true joint compared with predicted joint j, (B, J); -1 where none links those parts.
+def confusion(
+    part_true: Int[np.ndarray, "B N"], label: Int[np.ndarray, "B N"], parts: int
+) -> Int[np.ndarray, "B P P"]:
+    """Points of true part t in predicted slot q, (B, P, P), and answers outside 0..P-1 dropped.
 
-    Predicted joint j links slots 0 and j+1; a true joint exists between two parts if one of them
-    is the base.
+    Points with a negative true label are ignored.
     """
-    base, child = order[:, :1], order[:, 1:]
-    return np.where((base == 0) | (child == 0), np.maximum(base, child) - 1, -1)
+    batch = np.arange(len(part_true))[:, None] * parts
+    inside = (part_true >= 0) & (part_true < parts) & (label >= 0) & (label < parts)
+    index = ((batch + part_true) * parts + label)[inside]
+    counts = np.bincount(index, minlength=len(part_true) * parts * parts)
+    return counts.reshape(-1, parts, parts)
+
+
+def soft_confusion(
+    part_true: Int[np.ndarray, "B N"], weight: Num[np.ndarray, "B N P"]
+) -> Float[np.ndarray, "B P P"]:
+    """Predicted weight of slot q on the points of true part t, (B, P, P); NaN counts nothing."""
+    slots = weight.shape[-1]
+    weight = np.nan_to_num(weight.astype(np.float64))
+    rows = [np.einsum("bn,bnq->bq", part_true == part, weight) for part in range(slots)]
+    return np.stack(rows, 1)
+
+
+def overlap(
+    shared: Num[np.ndarray, "B P P"],
+    true_count: Num[np.ndarray, "B P"],
+    slot_count: Num[np.ndarray, "B P"],
+) -> Float[np.ndarray, "B P P"]:
+    """IoU of true part t and slot q from their intersection and sizes; 0/0 is NaN."""
+    union = true_count[:, :, None] + slot_count[:, None, :] - shared
+    return np.divide(shared, union, out=np.full(shared.shape, np.nan), where=union > 0)
+
+
+def hard_labels(part: Num[np.ndarray, "B N *P"]) -> Int[np.ndarray, "B N"]:
+    """Labels of weights (B, N, P) by argmax, ties to the lower index; labels (B, N) unchanged.
+
+    A point whose weights are not all numbers is -1: it has no answer.
+    """
+    if part.ndim == 2:
+        return part.astype(np.int64, copy=False)
+    part = part.astype(np.float32, copy=False) if part.dtype == np.float16 else part
+    best = part[..., 0]
+    label = np.zeros(best.shape, np.int64)
+    undefined = np.isnan(best)
+    for index in range(1, part.shape[-1]):  # argmax over a short last axis is slow in numpy
+        larger = part[..., index] > best
+        label[larger] = index
+        best = np.where(larger, part[..., index], best)
+        undefined |= np.isnan(part[..., index])
+    label[undefined] = -1
+    return label
+
+
+def as_weights(label: Int[np.ndarray, "B N"], parts: int) -> Float[np.ndarray, "B N P"]:
+    """One-hot weights; labels outside 0..P-1 have none."""
+    return (label[..., None] == np.arange(parts)).astype(np.float64)
 
 
 def is_swapped(order: Int[np.ndarray, "B P"]) -> Bool[np.ndarray, " B"]:
@@ -144,13 +147,25 @@ def is_swapped(order: Int[np.ndarray, "B P"]) -> Bool[np.ndarray, " B"]:
     return (order == part_orders(parts)[1]).all(1)
 
 
-DRAWS = 100
-"""Random draws of the consensus search, each of `DRAW_SIZE` samples and each of one sample."""
-DRAW_SIZE = 5
-ROTATION_INLIER = 10.0
-"""Degrees."""
-TRANSLATION_INLIER = 0.25
-"""In the unit of the fit: 4 x mean radius for the benchmark."""
+def joint_order(order: Int[np.ndarray, "B P"]) -> Int[np.ndarray, "B J"]:
+    """The true joint compared with predicted joint j, (B, J); -1 where none links those parts.
+
+    Predicted joint j links slots 0 and j+1; a true joint exists between two parts if one of them
+    is the base.
+    """
+    base, child = order[:, :1], order[:, 1:]
+    return np.where((base == 0) | (child == 0), np.maximum(base, child) - 1, -1)
+
+
+def reorder_joints(
+    values: Num[np.ndarray, "B J *rest"], order: Int[np.ndarray, "B P"]
+) -> Float[np.ndarray, "B J *rest"]:
+    """True joint quantities by predicted joint; NaN where `joint_order` has none."""
+    joint = joint_order(order)
+    index = np.maximum(joint, 0).reshape(*joint.shape, *[1] * (values.ndim - 2))
+    out = np.take_along_axis(values, index, 1).astype(np.float64)
+    out[joint < 0] = np.nan
+    return out
 
 
 def reorder_poses(
@@ -166,41 +181,25 @@ def reorder_poses(
     return poses
 
 
-def reorder_joints(
-    values: Num[np.ndarray, "B J *rest"], order: Int[np.ndarray, "B P"]
-) -> Float[np.ndarray, "B J *rest"]:
-    """True joint quantities by predicted joint; NaN where `joint_order` has none."""
-    joint = joint_order(order)
-    index = np.maximum(joint, 0).reshape(*joint.shape, *[1] * (values.ndim - 2))
-    out = np.take_along_axis(values, index, 1).astype(np.float64)
-    out[joint < 0] = np.nan
-    return out
+def fit_calibration(
+    camera_T_part_pred: np.ndarray,
+    camera_T_part_true: np.ndarray,
+    *,
+    scale: np.ndarray | None = None,
+    seed: int = 0,
+) -> np.ndarray:
+    """Constant offsets T, (P, 4, 4), with pred @ T = true for most samples (docs/protocol.md).
 
+    Args:
+        camera_T_part_pred: (B, P, 4, 4).
+        camera_T_part_true: (B, P, 4, 4), order-matched and symmetry-corrected.
+        scale: (B,) divides the translations of both before the fit.
+        seed: Of the random draws.
 
-def nearest_orthogonal(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
-    """U V^T of the singular value decomposition, reflections included; NaN if not finite."""
-    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
-    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
-    return np.where(finite, u @ vt, np.nan)
-
-
-def project_rotations(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
-    """Nearest rotations (SVD, det +1); NaN where an entry is not finite."""
-    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
-    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
-    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
-    return np.where(finite, u @ vt, np.nan)
-
-
-def rotation_degrees(
-    a: Float[np.ndarray, "*#B 3 3"], b: Float[np.ndarray, "*#B 3 3"]
-) -> Float[np.ndarray, "*B"]:
-    """Angle of a b^T in degrees by atan2, exact near 0 and near 180."""
-    relative = a @ np.swapaxes(b, -1, -2)
-    skew = relative - np.swapaxes(relative, -1, -2)
-    sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
-    cosine = np.trace(relative, axis1=-2, axis2=-1) - 1
-    return np.degrees(np.arctan2(sine, cosine))
+    Returns:
+        One offset per part; NaN for a part without a finite prediction.
+    """
+    return calibrate(camera_T_part_pred, camera_T_part_true, scale=scale, seed=seed).offsets
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,27 +215,6 @@ class Calibration:
     answered: Int[np.ndarray, " P"]
     """Samples with a finite pose."""
     seed: int
-
-
-def fit_calibration(
-    camera_T_part_pred: np.ndarray,
-    camera_T_part_true: np.ndarray,
-    *,
-    scale: np.ndarray | None = None,
-    seed: int = 0,
-) -> np.ndarray:
-    """Constant offsets T, (P, 4, 4), with pred @ T = true for most samples (PROTOCOL 1.6).
-
-    Args:
-        camera_T_part_pred: (B, P, 4, 4).
-        camera_T_part_true: (B, P, 4, 4), order-matched and symmetry-corrected.
-        scale: (B,) divides the translations of both before the fit.
-        seed: Of the random draws.
-
-    Returns:
-        One offset per part; NaN for a part without a finite prediction.
-    """
-    return calibrate(camera_T_part_pred, camera_T_part_true, scale=scale, seed=seed).offsets
 
 
 def calibrate(
@@ -262,6 +240,17 @@ def calibrate(
         answered=np.array([part[3] for part in parts]),
         seed=seed,
     )
+
+
+def apply_calibration(
+    camera_T_part_pred: np.ndarray, offsets: np.ndarray, *, scale: np.ndarray | None = None
+) -> np.ndarray:
+    """Poses of the true frames: pred @ offsets, their translations times `scale` (B,)."""
+    pred = np.asarray(camera_T_part_pred, np.float64)
+    own_T_part = np.broadcast_to(np.asarray(offsets, np.float64), pred.shape).copy()
+    if scale is not None:
+        own_T_part[..., :3, 3] *= np.asarray(scale, np.float64)[:, None, None]
+    return pred @ own_T_part
 
 
 def _consensus(
@@ -293,15 +282,6 @@ def _consensus(
     return offset, float(near.mean()), float(close.mean()), count
 
 
-def _residuals(
-    rotation: Float[np.ndarray, "B 3 3"],
-    shift: Float[np.ndarray, "B 3"],
-    turn: Float[np.ndarray, "3 3"],
-    move: Float[np.ndarray, " 3"],
-) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
-    return rotation_degrees(rotation, turn), np.linalg.norm(shift - move, axis=1)
-
-
 def _agree(
     rotation: Float[np.ndarray, "B 3 3"],
     shift: Float[np.ndarray, "B 3"],
@@ -310,6 +290,15 @@ def _agree(
 ) -> tuple[Bool[np.ndarray, " B"], Bool[np.ndarray, " B"]]:
     angle, distance = _residuals(rotation, shift, turn, move)
     return angle <= ROTATION_INLIER, distance <= TRANSLATION_INLIER
+
+
+def _residuals(
+    rotation: Float[np.ndarray, "B 3 3"],
+    shift: Float[np.ndarray, "B 3"],
+    turn: Float[np.ndarray, "3 3"],
+    move: Float[np.ndarray, " 3"],
+) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]]:
+    return rotation_degrees(rotation, turn), np.linalg.norm(shift - move, axis=1)
 
 
 def _refine(
@@ -338,12 +327,27 @@ def _refine(
     return turn, move
 
 
-def apply_calibration(
-    camera_T_part_pred: np.ndarray, offsets: np.ndarray, *, scale: np.ndarray | None = None
-) -> np.ndarray:
-    """Poses of the true frames: pred @ offsets, their translations times `scale` (B,)."""
-    pred = np.asarray(camera_T_part_pred, np.float64)
-    own_T_part = np.broadcast_to(np.asarray(offsets, np.float64), pred.shape).copy()
-    if scale is not None:
-        own_T_part[..., :3, 3] *= np.asarray(scale, np.float64)[:, None, None]
-    return pred @ own_T_part
+def nearest_orthogonal(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
+    """U V^T of the singular value decomposition, reflections included; NaN if not finite."""
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
+    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
+    return np.where(finite, u @ vt, np.nan)
+
+
+def project_rotations(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B 3 3"]:
+    """Nearest rotations (SVD, det +1); NaN where an entry is not finite."""
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))[..., None, None]
+    u, _, vt = np.linalg.svd(np.where(finite, matrix, np.eye(3)))
+    u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return np.where(finite, u @ vt, np.nan)
+
+
+def rotation_degrees(
+    a: Float[np.ndarray, "*#B 3 3"], b: Float[np.ndarray, "*#B 3 3"]
+) -> Float[np.ndarray, "*B"]:
+    """Angle of a b^T in degrees by atan2, exact near 0 and near 180."""
+    relative = a @ np.swapaxes(b, -1, -2)
+    skew = relative - np.swapaxes(relative, -1, -2)
+    sine = np.sqrt(skew[..., 2, 1] ** 2 + skew[..., 0, 2] ** 2 + skew[..., 1, 0] ** 2)
+    cosine = np.trace(relative, axis1=-2, axis2=-1) - 1
+    return np.degrees(np.arctan2(sine, cosine))

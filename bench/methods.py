@@ -1,64 +1,39 @@
 # SPDX-License-Identifier: MIT
-"""The methods that can be trained: one explicit line each."""
+"""The methods that can be trained: one explicit line each, nothing else to be told elsewhere.
+
+The library's own stand in `scapo.registry`, baselines here; other packages add theirs by the entry
+point group `scapo.methods`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING
 
-import torch
+from scapo.registry import LIBRARY, Method, known, load_method
 
-from bench.baselines.icp import Icp, IcpConfig
-from scapo.categories import category
-from scapo.method import AbstractMethod
-from scapo.paper.method import Scapo, ScapoConfig, cpu_config
-from scapo.registered.method import RegisteredScapo
-from scapo.registered.method import cpu_config as cpu_registered
-from scapo.store.checkpoint import config_from, load_arrays, read_checkpoint
-from scapo.store.files import Header
-from scapo.store.schema import StoreError
-from scapo.types import Category
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Method:
-    """How a method is made."""
-
-    build: Callable[[Any, Category, torch.Generator], AbstractMethod]
-    """From configuration, category and the generator of its first weights."""
-    presets: Mapping[str, Any]
-    """Configurations by name; the first is the default of the command line."""
-
-    @property
-    def kind(self) -> type[Any]:
-        """The configuration's class."""
-        return cast("type[Any]", type(self.preset(None)))
-
-    def preset(self, name: str | None) -> Any:  # noqa: ANN401 - of the method's own type
-        """The configuration of that name, or the default."""
-        return self.presets.get(name or "", next(iter(self.presets.values())))
-
+if TYPE_CHECKING:
+    from scapo.method import AbstractMethod
+    from scapo.store.files import Header
 
 METHODS: dict[str, Method] = {
-    "scapo": Method(build=Scapo, presets={"paper": ScapoConfig(), "cpu": cpu_config()}),
-    "registered": Method(build=RegisteredScapo, presets={"cpu": cpu_registered()}),
-    "icp": Method(build=Icp, presets={"paper": IcpConfig()}),
-}
+    **LIBRARY,
+    "icp": Method(title="ICP", rank=40, maker="bench.baselines.icp:Icp",
+                  presets={"paper": "bench.baselines.icp:IcpConfig"},
+                  supervision=("segmentation", "pose")),
+}  # fmt: skip
+
+
+def all_methods() -> dict[str, Method]:
+    """METHODS and those of other packages."""
+    return known(METHODS)
+
+
+def find(name: str) -> Method | None:
+    """The method of this name; other packages are asked only where METHODS lacks it."""
+    return METHODS.get(name) or known(METHODS).get(name)
 
 
 def load(run: Path) -> tuple[AbstractMethod, Header]:
-    """The trained method of a run folder or checkpoint file, in eval mode on the CPU.
-
-    Raises:
-        StoreError: No checkpoint there, or not one of METHODS.
-    """
-    arrays, header = read_checkpoint(run)
-    name = header.get("method")
-    if name not in METHODS:
-        raise StoreError(f"{run}: expected a method of {', '.join(METHODS)}, found {name!r}")
-    config: Any = config_from(METHODS[name].kind, header["config"], f"{run}: config")
-    method = METHODS[name].build(config, category(header["category"]), torch.Generator())
-    load_arrays(method, arrays, run)
-    return method.eval(), header
+    """The trained method of a run folder or checkpoint file; see `scapo.registry.load_method`."""
+    return load_method(run, all_methods())

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The errors of a prediction, one number per sample and slot, and the precision made of them.
 
-Pure functions of numpy arrays (PROTOCOL 1, CONTRACT 5). A slot is a predicted part or joint.
-What cannot be computed is NaN, never perfect. Angles are degrees, lengths those of the input.
-
-Average precision of Table 2: shares of samples within limits (PROTOCOL 1.8).
+Pure functions of numpy arrays (docs/protocol.md). A slot is a predicted part or joint. What cannot
+be computed is NaN, never perfect. Angles are degrees, lengths those of the input.
 """
 
 from __future__ import annotations
@@ -31,6 +29,244 @@ from bench.matching import (
 ApRule = Literal["mean", "min", "per-part"]
 
 
+IouKind = Literal["hard", "soft"]
+
+
+PivotKind = Literal["point-line", "line-line"]
+
+
+RotationKind = Literal["full", "folded"]
+
+
+PARALLEL = 1e-6
+"""Sine below which two lines count as parallel."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Metric:
+    """What a name in the scores means."""
+
+    name: str
+    per: Literal["part", "joint", "sample"]
+    higher_is_better: bool
+    units: tuple[str, ...]
+    """As in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
+
+
+METRICS = (
+    Metric(name="iou", per="part", higher_is_better=True, units=("1",)),
+    Metric(name="joint_direction", per="joint", higher_is_better=False, units=("deg",)),
+    Metric(name="joint_pivot", per="joint", higher_is_better=False, units=("r4", "m")),
+    Metric(name="joint_state", per="joint", higher_is_better=False, units=("deg", "r4", "m")),
+    Metric(name="part_rotation", per="part", higher_is_better=False, units=("deg",)),
+    Metric(name="part_translation", per="part", higher_is_better=False, units=("r4", "m")),
+    Metric(name="reconstruction", per="sample", higher_is_better=False, units=("r4", "m")),
+)
+
+
+def sample_errors(  # noqa: PLR0913
+    *,
+    part_true: np.ndarray,
+    camera_T_part_true: np.ndarray,
+    pivot_true: np.ndarray,
+    axis_true: np.ndarray,
+    part_pred: np.ndarray,
+    camera_T_part_pred: np.ndarray | None,
+    pivot_pred: np.ndarray | None,
+    axis_pred: np.ndarray | None,
+    symmetry: np.ndarray | None = None,
+    label_order: LabelOrder = "sample",
+    iou: IouKind = "hard",
+    pivot: PivotKind = "point-line",
+    rotation: RotationKind = "full",
+) -> dict[str, np.ndarray]:
+    """All errors of a batch after matching the part order.
+
+    Args:
+        part_true: (B, N) ints, negative = ignored.
+        camera_T_part_true: (B, P, 4, 4).
+        pivot_true: (B, J, 3), a point on the axis.
+        axis_true: (B, J, 3), of any length.
+        part_pred: (B, N) ints or (B, N, P) weights.
+        camera_T_part_pred: (B, P, 4, 4), in the true part frames, or None.
+        pivot_pred: (B, J, 3) or None.
+        axis_pred: (B, J, 3), of any length, or None.
+        symmetry: (3, 3) right-multiplied to the true rotations of swapped samples.
+        label_order: Who chooses the order of the parts, see `matching.choose_order`.
+        iou: `hard` on labels, `soft` on weights: sum(g q) / (sum g + sum q - sum g q).
+        pivot: `point-line`: predicted pivot to true axis. `line-line`: between the two axes.
+        rotation: `folded` takes min(e, 180 - e).
+
+    Returns:
+        `order` (B, P), `iou` (B, P), `joint_direction` (B, J), `joint_pivot` (B, J),
+        `part_rotation` (B, P), `part_translation` (B, P); slot = predicted slot.
+    """
+    parts = camera_T_part_true.shape[1]
+    agreement = agree(
+        np.asarray(part_true), np.asarray(part_pred), parts, label_order=label_order, iou=iou
+    )
+    poses = reorder_poses(np.asarray(camera_T_part_true), agreement.order, symmetry)
+    turn, shift = pose_errors(poses, camera_T_part_pred, rotation)
+    direction, distance = joint_errors(
+        reorder_joints(np.asarray(pivot_true), agreement.order),
+        reorder_joints(np.asarray(axis_true), agreement.order),
+        pivot_pred,
+        axis_pred,
+        pivot,
+    )
+    return {
+        "order": agreement.order,
+        "iou": agreement.iou,
+        "joint_direction": direction,
+        "joint_pivot": distance,
+        "part_rotation": turn,
+        "part_translation": shift,
+    }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """How predicted labels meet the true ones."""
+
+    order: Int[np.ndarray, "B P"]
+    """The true part compared with each slot."""
+    iou: Float[np.ndarray, "B P"]
+    """In that order."""
+
+
+def agree(
+    part_true: Int[np.ndarray, "B N"],
+    part_pred: Num[np.ndarray, "B N *P"],
+    parts: int,
+    *,
+    label_order: LabelOrder | Int[np.ndarray, "B P"],
+    iou: IouKind,
+) -> Agreement:
+    """Order and IoU (docs/protocol.md); `label_order` may be the order itself."""
+    label = hard_labels(part_pred)
+    known = (part_true >= 0) & (part_true < parts)
+    true_count = np.stack([(part_true == p).sum(1) for p in range(parts)], 1)
+    slot_count = np.stack([(known & (label == p)).sum(1) for p in range(parts)], 1)
+    counts = confusion(part_true, label, parts)
+    if iou == "soft" or (isinstance(label_order, str) and label_order == "hungarian"):
+        weight = part_pred if part_pred.ndim == 3 else as_weights(label, parts)
+        shared = soft_confusion(part_true, weight)
+        soft = overlap(shared, true_count, shared.sum(1))
+    else:
+        soft = np.zeros(counts.shape)
+    order = choose_order(counts, label_order, soft) if isinstance(label_order, str) else label_order
+    table = soft if iou == "soft" else overlap(counts, true_count, slot_count)
+    value = table[np.arange(len(order))[:, None], order, np.arange(parts)]
+    answered = np.asarray((label >= 0).any(1))
+    return Agreement(order=order, iou=np.where(answered[:, None], value, np.nan))
+
+
+def pose_errors(
+    true: Float[np.ndarray, "B P 4 4"],
+    pred: Num[np.ndarray, "B P 4 4"] | None,
+    rotation: RotationKind = "full",
+) -> tuple[Float[np.ndarray, "B P"], Float[np.ndarray, "B P"]]:
+    """Rotation error in degrees and translation error (docs/protocol.md).
+
+    The predicted rotation is brought to the nearest orthogonal matrix first, as published; a
+    reflection has no angle and is NaN.
+    """
+    if pred is None:
+        nothing = np.full(true.shape[:2], np.nan)
+        return nothing, nothing.copy()
+    pred = np.asarray(pred, np.float64)
+    shift = np.linalg.norm(true[..., :3, 3] - pred[..., :3, 3], axis=-1)
+    matrix = pred[..., :3, :3]
+    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))
+    u, size, vt = np.linalg.svd(np.where(finite[..., None, None], matrix, np.eye(3)))
+    nearest = u @ vt
+    angle = rotation_degrees(true[..., :3, :3], nearest)
+    usable = finite & (np.linalg.det(nearest) > 0) & (size[..., 2] > 1e-6 * size[..., 0])
+    angle = np.where(usable, angle, np.nan)
+    if rotation == "folded":
+        angle = np.minimum(angle, 180 - angle)
+    return angle, shift
+
+
+def joint_errors(
+    pivot_true: Float[np.ndarray, "B J 3"],
+    axis_true: Float[np.ndarray, "B J 3"],
+    pivot_pred: Num[np.ndarray, "B J 3"] | None,
+    axis_pred: Num[np.ndarray, "B J 3"] | None,
+    kind: PivotKind = "point-line",
+) -> tuple[Float[np.ndarray, "B J"], Float[np.ndarray, "B J"]]:
+    """Angle between the undirected axes in degrees, and distance of the pivot."""
+    nothing = np.full(pivot_true.shape[:2], np.nan)
+    true = unit(axis_true)
+    pred = None if axis_pred is None else unit(np.asarray(axis_pred, np.float64))
+    direction = nothing if pred is None else line_degrees(true, pred)
+    if pivot_pred is None or (kind == "line-line" and pred is None):
+        return direction, nothing.copy()
+    offset = np.asarray(pivot_pred, np.float64) - pivot_true
+    distance = np.linalg.norm(np.cross(offset, true), axis=-1)
+    if kind == "line-line" and pred is not None:
+        normal = np.cross(true, pred)
+        sine = np.linalg.norm(normal, axis=-1)
+        between = np.abs((offset * normal).sum(-1)) / np.maximum(sine, PARALLEL)
+        distance = np.where(sine > PARALLEL, between, distance)
+        distance = np.where(np.isfinite(sine), distance, np.nan)
+    return direction, distance
+
+
+def unit(axis: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+    """Axes of length one; NaN for a zero axis."""
+    largest = np.abs(axis).max(-1, keepdims=True)
+    largest = np.where(largest > 0, largest, np.nan)
+    axis = axis / largest  # no underflow in the norm of a tiny axis
+    return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+
+
+def line_degrees(
+    a: Float[np.ndarray, "*B 3"], b: Float[np.ndarray, "*B 3"]
+) -> Float[np.ndarray, "*B"]:
+    """Angle between two lines by their unit directions, at most 90 degrees; exact near 0."""
+    sine = np.linalg.norm(np.cross(a, b), axis=-1)
+    return np.degrees(np.arctan2(sine, np.abs((a * b).sum(-1))))
+
+
+def state_errors(
+    *,
+    state_true: Float[np.ndarray, "B J"],
+    state_pred: Float[np.ndarray, "B J"],
+    revolute: np.ndarray,
+    offset: Float[np.ndarray, "*#B J"],
+    sign: Float[np.ndarray, "B J"],
+) -> Float[np.ndarray, "B J"]:
+    """|s phi + offset - theta| (docs/protocol.md), radians (around the circle) or a length.
+
+    Args:
+        state_true: theta, ordered like the predicted joints.
+        state_pred: phi.
+        revolute: (J,) bool.
+        offset: Of each joint, 0 for a method that knows the rest state.
+        sign: See `state_sign`.
+    """
+    difference = sign * state_pred + offset - state_true
+    around = np.abs((difference + np.pi) % (2 * np.pi) - np.pi)
+    return np.where(revolute, around, np.abs(difference))
+
+
+def state_sign(
+    axis_true: Float[np.ndarray, "B J 3"],
+    axis_pred: Num[np.ndarray, "B J 3"] | None,
+    reversed_: np.ndarray,
+) -> Float[np.ndarray, "B J"]:
+    """+1 where predicted and true axis agree, -1 where they oppose.
+
+    Where the two parts are swapped (`reversed_`, (B,) bool, two parts only), the predicted child
+    is the true base, which moves the other way: the true axis counts as reversed.
+    """
+    if axis_pred is None:
+        return np.ones(axis_true.shape[:2])
+    sign = np.where((axis_true * np.asarray(axis_pred, np.float64)).sum(-1) < 0, -1.0, 1.0)
+    return np.where(reversed_[:, None], -sign, sign)
+
+
 def average_precision(
     *,
     iou: np.ndarray,
@@ -40,7 +276,7 @@ def average_precision(
     joint_pivot: np.ndarray,
     rule: str = "mean",
 ) -> dict[str, float]:
-    """Shares of Table 2 (PROTOCOL 1.8): IoU over 75 and 50 %, errors under k degrees and k cm.
+    """Shares of Table 2 (docs/protocol.md): IoU over 75 and 50 %, errors under k degrees and k cm.
 
     `mean`: per sample, the mean over its parts (joints) of each error is compared. `min`: every
     part (joint) must pass. `per-part`: parts (joints) are counted one by one. Comparisons are
@@ -116,255 +352,3 @@ class _Join:
         if self.rule == "per-part":
             return values
         return values.max(1) if self.rule == "min" else values.mean(1)
-
-
-__all__ = [
-    "METRICS",
-    "Agreement",
-    "ApRule",
-    "IouKind",
-    "Metric",
-    "PivotKind",
-    "RotationKind",
-    "agree",
-    "average_precision",
-    "joint_errors",
-    "pose_errors",
-    "precision_passes",
-    "sample_errors",
-    "state_errors",
-    "state_sign",
-    "unit",
-]
-
-IouKind = Literal["hard", "soft"]
-PivotKind = Literal["point-line", "line-line"]
-RotationKind = Literal["full", "folded"]
-
-PARALLEL = 1e-6
-"""Sine below which two lines count as parallel."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Agreement:
-    """How predicted labels meet the true ones."""
-
-    order: Int[np.ndarray, "B P"]
-    """The true part compared with each slot."""
-    iou: Float[np.ndarray, "B P"]
-    """In that order."""
-
-
-def sample_errors(  # noqa: PLR0913
-    *,
-    part_true: np.ndarray,
-    camera_T_part_true: np.ndarray,
-    pivot_true: np.ndarray,
-    axis_true: np.ndarray,
-    part_pred: np.ndarray,
-    camera_T_part_pred: np.ndarray | None,
-    pivot_pred: np.ndarray | None,
-    axis_pred: np.ndarray | None,
-    symmetry: np.ndarray | None = None,
-    label_order: LabelOrder = "sample",
-    iou: IouKind = "hard",
-    pivot: PivotKind = "point-line",
-    rotation: RotationKind = "full",
-) -> dict[str, np.ndarray]:
-    """All errors of a batch after matching the part order.
-
-    Args:
-        part_true: (B, N) ints, negative = ignored.
-        camera_T_part_true: (B, P, 4, 4).
-        pivot_true: (B, J, 3), a point on the axis.
-        axis_true: (B, J, 3), of any length.
-        part_pred: (B, N) ints or (B, N, P) weights.
-        camera_T_part_pred: (B, P, 4, 4), in the true part frames, or None.
-        pivot_pred: (B, J, 3) or None.
-        axis_pred: (B, J, 3), of any length, or None.
-        symmetry: (3, 3) right-multiplied to the true rotations of swapped samples.
-        label_order: Who chooses the order of the parts, see `matching.choose_order`.
-        iou: `hard` on labels, `soft` on weights: sum(g q) / (sum g + sum q - sum g q).
-        pivot: `point-line`: predicted pivot to true axis. `line-line`: between the two axes.
-        rotation: `folded` takes min(e, 180 - e).
-
-    Returns:
-        `order` (B, P), `iou` (B, P), `joint_direction` (B, J), `joint_pivot` (B, J),
-        `part_rotation` (B, P), `part_translation` (B, P); slot = predicted slot.
-    """
-    parts = camera_T_part_true.shape[1]
-    agreement = agree(
-        np.asarray(part_true), np.asarray(part_pred), parts, label_order=label_order, iou=iou
-    )
-    poses = reorder_poses(np.asarray(camera_T_part_true), agreement.order, symmetry)
-    turn, shift = pose_errors(poses, camera_T_part_pred, rotation)
-    direction, distance = joint_errors(
-        reorder_joints(np.asarray(pivot_true), agreement.order),
-        reorder_joints(np.asarray(axis_true), agreement.order),
-        pivot_pred,
-        axis_pred,
-        pivot,
-    )
-    return {
-        "order": agreement.order,
-        "iou": agreement.iou,
-        "joint_direction": direction,
-        "joint_pivot": distance,
-        "part_rotation": turn,
-        "part_translation": shift,
-    }
-
-
-def agree(
-    part_true: Int[np.ndarray, "B N"],
-    part_pred: Num[np.ndarray, "B N *P"],
-    parts: int,
-    *,
-    label_order: LabelOrder | Int[np.ndarray, "B P"],
-    iou: IouKind,
-) -> Agreement:
-    """Order and IoU (PROTOCOL 1.2, 1.3); `label_order` may be the order itself."""
-    label = hard_labels(part_pred)
-    known = (part_true >= 0) & (part_true < parts)
-    true_count = np.stack([(part_true == p).sum(1) for p in range(parts)], 1)
-    slot_count = np.stack([(known & (label == p)).sum(1) for p in range(parts)], 1)
-    counts = confusion(part_true, label, parts)
-    if iou == "soft" or (isinstance(label_order, str) and label_order == "hungarian"):
-        weight = part_pred if part_pred.ndim == 3 else as_weights(label, parts)
-        shared = soft_confusion(part_true, weight)
-        soft = overlap(shared, true_count, shared.sum(1))
-    else:
-        soft = np.zeros(counts.shape)
-    order = choose_order(counts, label_order, soft) if isinstance(label_order, str) else label_order
-    table = soft if iou == "soft" else overlap(counts, true_count, slot_count)
-    value = table[np.arange(len(order))[:, None], order, np.arange(parts)]
-    answered = np.asarray((label >= 0).any(1))
-    return Agreement(order=order, iou=np.where(answered[:, None], value, np.nan))
-
-
-def pose_errors(
-    true: Float[np.ndarray, "B P 4 4"],
-    pred: Num[np.ndarray, "B P 4 4"] | None,
-    rotation: RotationKind = "full",
-) -> tuple[Float[np.ndarray, "B P"], Float[np.ndarray, "B P"]]:
-    """Rotation error in degrees and translation error (PROTOCOL 1.5).
-
-    The predicted rotation is brought to the nearest orthogonal matrix first, as published; a
-    reflection has no angle and is NaN.
-    """
-    if pred is None:
-        nothing = np.full(true.shape[:2], np.nan)
-        return nothing, nothing.copy()
-    pred = np.asarray(pred, np.float64)
-    shift = np.linalg.norm(true[..., :3, 3] - pred[..., :3, 3], axis=-1)
-    matrix = pred[..., :3, :3]
-    finite = np.asarray(np.isfinite(matrix).all((-2, -1)))
-    u, size, vt = np.linalg.svd(np.where(finite[..., None, None], matrix, np.eye(3)))
-    nearest = u @ vt
-    angle = rotation_degrees(true[..., :3, :3], nearest)
-    usable = finite & (np.linalg.det(nearest) > 0) & (size[..., 2] > 1e-6 * size[..., 0])
-    angle = np.where(usable, angle, np.nan)
-    if rotation == "folded":
-        angle = np.minimum(angle, 180 - angle)
-    return angle, shift
-
-
-def joint_errors(
-    pivot_true: Float[np.ndarray, "B J 3"],
-    axis_true: Float[np.ndarray, "B J 3"],
-    pivot_pred: Num[np.ndarray, "B J 3"] | None,
-    axis_pred: Num[np.ndarray, "B J 3"] | None,
-    kind: PivotKind = "point-line",
-) -> tuple[Float[np.ndarray, "B J"], Float[np.ndarray, "B J"]]:
-    """Angle between the undirected axes in degrees, and distance of the pivot (PROTOCOL 1.4)."""
-    nothing = np.full(pivot_true.shape[:2], np.nan)
-    true = unit(axis_true)
-    pred = None if axis_pred is None else unit(np.asarray(axis_pred, np.float64))
-    direction = nothing if pred is None else line_degrees(true, pred)
-    if pivot_pred is None or (kind == "line-line" and pred is None):
-        return direction, nothing.copy()
-    offset = np.asarray(pivot_pred, np.float64) - pivot_true
-    distance = np.linalg.norm(np.cross(offset, true), axis=-1)
-    if kind == "line-line" and pred is not None:
-        normal = np.cross(true, pred)
-        sine = np.linalg.norm(normal, axis=-1)
-        between = np.abs((offset * normal).sum(-1)) / np.maximum(sine, PARALLEL)
-        distance = np.where(sine > PARALLEL, between, distance)
-        distance = np.where(np.isfinite(sine), distance, np.nan)
-    return direction, distance
-
-
-def unit(axis: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
-    """Axes of length one; NaN for a zero axis."""
-    largest = np.abs(axis).max(-1, keepdims=True)
-    largest = np.where(largest > 0, largest, np.nan)
-    axis = axis / largest  # no underflow in the norm of a tiny axis
-    return axis / np.linalg.norm(axis, axis=-1, keepdims=True)
-
-
-def line_degrees(
-    a: Float[np.ndarray, "*B 3"], b: Float[np.ndarray, "*B 3"]
-) -> Float[np.ndarray, "*B"]:
-    """Angle between two lines by their unit directions, at most 90 degrees; exact near 0."""
-    sine = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.degrees(np.arctan2(sine, np.abs((a * b).sum(-1))))
-
-
-def state_errors(
-    *,
-    state_true: Float[np.ndarray, "B J"],
-    state_pred: Float[np.ndarray, "B J"],
-    revolute: np.ndarray,
-    offset: Float[np.ndarray, "*#B J"],
-    sign: Float[np.ndarray, "B J"],
-) -> Float[np.ndarray, "B J"]:
-    """|s phi + offset - theta| (PROTOCOL 1.9), radians (around the circle) or a length.
-
-    Args:
-        state_true: theta, ordered like the predicted joints.
-        state_pred: phi.
-        revolute: (J,) bool.
-        offset: Of each joint, 0 for a method that knows the rest state.
-        sign: See `state_sign`.
-    """
-    difference = sign * state_pred + offset - state_true
-    around = np.abs((difference + np.pi) % (2 * np.pi) - np.pi)
-    return np.where(revolute, around, np.abs(difference))
-
-
-def state_sign(
-    axis_true: Float[np.ndarray, "B J 3"],
-    axis_pred: Num[np.ndarray, "B J 3"] | None,
-    reversed_: np.ndarray,
-) -> Float[np.ndarray, "B J"]:
-    """+1 where predicted and true axis agree, -1 where they oppose.
-
-    Where the two parts are swapped (`reversed_`, (B,) bool, two parts only), the predicted child
-    is the true base, which moves the other way: the true axis counts as reversed.
-    """
-    if axis_pred is None:
-        return np.ones(axis_true.shape[:2])
-    sign = np.where((axis_true * np.asarray(axis_pred, np.float64)).sum(-1) < 0, -1.0, 1.0)
-    return np.where(reversed_[:, None], -sign, sign)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Metric:
-    """What a name in the scores means."""
-
-    name: str
-    per: Literal["part", "joint", "sample"]
-    higher_is_better: bool
-    units: tuple[str, ...]
-    """As in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
-
-
-METRICS = (
-    Metric(name="iou", per="part", higher_is_better=True, units=("1",)),
-    Metric(name="joint_direction", per="joint", higher_is_better=False, units=("deg",)),
-    Metric(name="joint_pivot", per="joint", higher_is_better=False, units=("r4", "m")),
-    Metric(name="joint_state", per="joint", higher_is_better=False, units=("deg", "r4", "m")),
-    Metric(name="part_rotation", per="part", higher_is_better=False, units=("deg",)),
-    Metric(name="part_translation", per="part", higher_is_better=False, units=("r4", "m")),
-    Metric(name="reconstruction", per="sample", higher_is_better=False, units=("r4", "m")),
-)

@@ -22,22 +22,13 @@ its origin at the centre of the bounding box at rest; a part's frame is the obje
 carried along by the part. `a_T_b` maps coordinates in b to a; points are rows.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from scapo.categories import CATEGORIES, category
-from scapo.types import (
-    Category,
-    Joints,
-    JointSpec,
-    Labels,
-    Observation,
-    Prediction,
-    Sample,
-    SampleKey,
-)
-
 if TYPE_CHECKING:
+    from scapo.categories import CATEGORIES, Category, JointSpec, category
     from scapo.predictor import load
+    from scapo.types import Joints, Labels, Observation, Prediction, Sample, SampleKey
 
 __all__ = [
     "CATEGORIES",
@@ -53,11 +44,18 @@ __all__ = [
     "load",
 ]
 
+_HOMES = {
+    "CATEGORIES": "categories",
+    "Category": "categories",
+    "JointSpec": "categories",
+    "category": "categories",
+    "load": "predictor",
+}
+"""Where a name comes from; the others from `types`."""
+
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401
-    """`load` when it is asked for: the networks take two seconds to import, and data needs none."""
-    if name == "load":
-        from scapo.predictor import load
-
-        return load
+    """A name when it is asked for: torch takes a second to import, and help texts need none."""
+    if name in __all__:
+        return getattr(import_module(f"scapo.{_HOMES.get(name, 'types')}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

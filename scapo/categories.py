@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The nine categories as data: parts, joints, travel, viewing window, symmetry, size.
+"""What a category is, and the nine as data: parts, joints, travel, viewing window, symmetry, size.
+
+A category is one entry here. Imports nothing heavy: help texts list the names.
 
 Object frame: z up, the front (door, drawer, user side) faces -x, origin = centre of the bounding
 box at rest. Travel is what real objects of the category do: laptops open to 120 to 150 degrees,
@@ -8,9 +10,61 @@ oven doors to 90, glasses fold to about 80, drawers pull out most of their depth
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import radians
+from typing import Literal
 
-from scapo.types import Category, JointSpec, Matrix3, Window
+JointKind = Literal["revolute", "prismatic"]
+RestRule = Literal["smallest-box", "largest-box", "tallest"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JointSpec:
+    """One joint of a category: its kind, the parts it links and its travel from rest."""
+
+    kind: JointKind
+    parent: int
+    """Part index of the parent, 0 for all benchmark categories."""
+    child: int
+    lower: float
+    """Smallest state, rad or m; 0 is rest."""
+    upper: float
+    """Largest state of the category, rad or m. An instance may stop earlier."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """Where a person would look from: camera angles about the object, degrees.
+
+    `azimuth` turns about the object's z axis, 0 looks at the front (camera on the -x side),
+    positive counter-clockwise seen from above; `elevation` is above the horizon.
+    """
+
+    azimuth: tuple[float, float]
+    elevation: tuple[float, float]
+
+
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Category:
+    """What is fixed for every instance of a category. `CATEGORIES` lists them."""
+
+    name: str
+    parts: tuple[str, ...]
+    joints: tuple[JointSpec, ...]
+    benchmark: tuple[Literal["clean", "sensor"], ...]
+    symmetry: Matrix3 | None
+    """Rotation A of the object frame that exchanges the parts (docs/data-format.md), or None."""
+    window: Window
+    diagonal: float
+    """Nominal diagonal of the box at rest in metres, for models without metric size."""
+    rest: RestRule
+    """Which joint limit is rest, for models that do not say: the one with this bounding box."""
+    words: tuple[str, ...]
+    """Link or semantic names that tell the moving parts of this category."""
+
 
 TURN_X: Matrix3 = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 """Half a turn about x: exchanges the halves of laptops, suitcases, scissors, the two temples."""

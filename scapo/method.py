@@ -15,8 +15,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from scapo.drawing import PictureData
-from scapo.types import Category, Labels, Observation, Prediction, Supervision
+from scapo.categories import Category
+from scapo.pictures import PictureData
+from scapo.types import Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "refine"]
 
@@ -31,11 +32,42 @@ class ParameterGroup:
     """Factor on the stage's learning rate."""
     begin: float = 0.0
     """Share of the stage that passes before these parameters are updated at all."""
+    weight_decay: float | None = None
+    """None: the stage's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Adam:
+    """Adam; weight decay is added to the gradient."""
+
+    betas: tuple[float, float] = (0.9, 0.999)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sgd:
+    """Stochastic gradient descent."""
+
+    momentum: float = 0.9
+    nesterov: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HalfCosine:
+    """The learning rate on half a cosine from the stage's `lr` to its `min_lr`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StepDecay:
+    """The learning rate times `factor` after every so many epochs, down to the stage's `min_lr`."""
+
+    every: int
+    """Epochs."""
+    factor: float = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stage:
-    """One run of the optimiser: Adam, the learning rate on half a cosine from `lr` to `min_lr`."""
+    """One run of the optimiser."""
 
     name: str
     epochs: int
@@ -46,17 +78,27 @@ class Stage:
     clouds: int | None = None
     """How many of the training clouds, evenly spread (`evenly`), it uses; None: all."""
     parameters: tuple[ParameterGroup, ...] = (ParameterGroup(module=""),)
+    optimiser: Adam | Sgd = Adam()
+    schedule: HalfCosine | StepDecay = HalfCosine()
+    validate_every: int | None = None
+    """Epochs between two passes of `validation_loss` over clouds that are not trained on; the
+    stage then ends with the state of the least. None: it ends with its last."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
-    """Where in the training a batch is, and the randomness it may use."""
+    """Where in the training a batch is, what it holds, and the randomness it may use."""
 
     stage: str
     progress: float
     """Share of the stage that is done, in [0, 1)."""
     generator: torch.Generator
     """On the device of the batch; the only source of randomness in `losses`."""
+    index: Int[Tensor, " B"]
+    """Which samples these are: rows of all clouds that `start` saw (of the validation clouds in
+    `validation_loss`), on the device of the batch."""
+    total: int
+    """How many clouds those are."""
 
 
 def evenly(total: int, count: int | None) -> Int[Tensor, " K"]:
@@ -80,7 +122,7 @@ def changes(
         default: Another of the same type.
         leave: Dotted names of fields that do not count.
 
-    >>> from scapo.registered.initialisation import DiscoveryConfig
+    >>> from scapo.registered.config import DiscoveryConfig
     >>> changed = DiscoveryConfig(draws=1, axis_weight=0.0, way_out=False)
     >>> changes(changed, DiscoveryConfig(), leave=["axis_weight"])
     ['way_out=False']
@@ -114,6 +156,8 @@ class AbstractMethod(nn.Module, ABC):
     name: ClassVar[str]
     networks: ClassVar[tuple[str, ...]] = ()
     """Submodules whose forward passes may run in reduced precision or compiled (`precision`)."""
+    least_points: int = 1
+    """Points that a cloud needs to be predicted at all."""
     config: Any
     """A frozen dataclass; stored in checkpoints."""
     category: Category
@@ -151,8 +195,21 @@ class AbstractMethod(nn.Module, ABC):
         Args:
             observation: A batch, camera frame, metres.
             labels: As allowed by `supervision`.
-            step: Stage, progress and randomness.
+            step: Stage, progress, samples and randomness.
         """
+
+    def validation_loss(self, observation: Observation, labels: Labels, step: Step) -> Tensor:
+        """How badly the method does on clouds that it is not trained on: a scalar to be small.
+
+        Called in eval mode without gradients, with the same random numbers each time; by default
+        the sum of `losses`.
+
+        Args:
+            observation: A batch of validation clouds, camera frame, metres.
+            labels: As allowed by `supervision`.
+            step: Stage, progress, samples and randomness.
+        """
+        return torch.stack(list(self.losses(observation, labels, step).values())).sum()
 
     @abstractmethod
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:

@@ -14,57 +14,7 @@ from typing import Literal
 from jaxtyping import Float, Int
 from torch import Tensor
 
-JointKind = Literal["revolute", "prismatic"]
-RestRule = Literal["smallest-box", "largest-box", "tallest"]
 Supervision = Literal["pose", "segmentation", "joint"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JointSpec:
-    """One joint of a category: its kind, the parts it links and its travel from rest."""
-
-    kind: JointKind
-    parent: int
-    """Part index of the parent, 0 for all benchmark categories."""
-    child: int
-    lower: float
-    """Smallest state, rad or m; 0 is rest."""
-    upper: float
-    """Largest state of the category, rad or m. An instance may stop earlier."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Window:
-    """Where a person would look from: camera angles about the object, degrees.
-
-    `azimuth` turns about the object's z axis, 0 looks at the front (camera on the -x side),
-    positive counter-clockwise seen from above; `elevation` is above the horizon.
-    """
-
-    azimuth: tuple[float, float]
-    elevation: tuple[float, float]
-
-
-Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Category:
-    """What is fixed for every instance of a category. `categories.CATEGORIES` lists them."""
-
-    name: str
-    parts: tuple[str, ...]
-    joints: tuple[JointSpec, ...]
-    benchmark: tuple[Literal["clean", "sensor"], ...]
-    symmetry: Matrix3 | None
-    """Rotation A of the object frame that exchanges the parts (CONTRACT 1), or None."""
-    window: Window
-    diagonal: float
-    """Nominal diagonal of the box at rest in metres, for models without metric size."""
-    rest: RestRule
-    """Which joint limit is rest, for models that do not say: the one with this bounding box."""
-    words: tuple[str, ...]
-    """Link or semantic names that tell the moving parts of this category."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

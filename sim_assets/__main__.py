@@ -10,15 +10,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
+from scapo.text import one_line
 from sim_assets.cli.verbs import VERBS
 
-DESCRIPTION = "Make and look at labelled point clouds of articulated objects."
+DESCRIPTION = (
+    "Make and look at labelled point clouds of articulated objects (--version: of which release)."
+)
 
 
 def _commands() -> Any:  # noqa: ANN401 - a union made at run time
@@ -28,23 +32,30 @@ def _commands() -> Any:  # noqa: ANN401 - a union made at run time
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and end the process."""
+    console, errors = Console(), Console(stderr=True)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words == ["--version"]:
+        _say(console, f"scapo-data {version('scapo')}")
+        sys.exit(0)
     command: Any = tyro.cli(
         _commands(),
         prog="scapo-data",
         description=DESCRIPTION,
-        args=arguments,
+        args=words,
         config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
     )
-    errors = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
-        sys.exit(command.run(Console()))
+        sys.exit(command.run(console))
     except (ValueError, OSError, RuntimeError) as error:
-        line = " ".join(str(error).split())
-        errors.print(f"scapo-data: {escape(line)}")
+        _say(errors, f"scapo-data: {error}")
         sys.exit(1)
     except KeyboardInterrupt:
-        errors.print("scapo-data: stopped; the same command takes it up where it was")
+        _say(errors, "scapo-data: stopped; the same command takes it up where it was")
         sys.exit(130)
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(Text(one_line(line)), soft_wrap=True)
 
 
 if __name__ == "__main__":

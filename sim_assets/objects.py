@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from scapo.types import Category
+from scapo.categories import Category
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,9 +28,23 @@ class Visual:
     """RGBA in [0, 1]; a mesh with its own texture keeps it in `mesh.visual`."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Account:
+    """What a reader decided about a model, for its user to see."""
+
+    joints: tuple[str, ...]
+    """Per joint of the category: the model's joint, and what it moves, in the model's words."""
+    size: str
+    """Sides of the box at rest, and how its scale was chosen."""
+    names: tuple[str, ...]
+    """What the model's links are called, by its semantics where it has them."""
+    speaks: bool
+    """Whether one of its names speaks of the category."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Origin:
-    """Where an object came from (the manifest's instance record, CONTRACT 3)."""
+    """Where an object came from (the manifest's instance record, docs/data-format.md)."""
 
     source: str
     """Path relative to the source folder, or the generator and its seed."""
@@ -46,6 +60,8 @@ class Origin:
     """state = sign * (q - rest)."""
     repairs: tuple[str, ...] = ()
     """What the reader put right, one sentence each."""
+    account: Account | None = None
+    """Of a model that was read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,133 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Why a method fails: its errors by what was seen, and its oracle ladder, as CSV and plots.
-
-The plots of `scapo-bench explain`, as PNG bytes.
-"""
+"""Why a method fails: its errors by what was seen, and its oracle ladder, measured and as CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from bench.analysis.ladder import RUNGS, Rung, climb, ladder_markdown
-from bench.analysis.strata import FACTORS, Stratum, factors, stratify
-from bench.scoring.evaluate import Request, fit_frames, open_data
+from bench.analysis.ladder import RUNGS, Rung, climb
+from bench.analysis.strata import Stratum, factors, stratify
+from bench.requests import Request
+from bench.scoring.evaluate import fit_frames, open_data
 from bench.scoring.predictions import Predictions
 from bench.scoring.scores import Errors
 from bench.scoring.truth import blocks
 from bench.statistics import Interval, interval
-from scapo.store import write_bytes
 from scapo.store.provenance import commit
-
-LABELS = {
-    ("iou", "1"): "IoU",
-    ("joint_direction", "deg"): "joint direction, deg",
-    ("joint_pivot", "r4"): "joint pivot, r4",
-    ("joint_state", "deg"): "joint state, deg",
-    ("joint_state", "r4"): "joint state, r4",
-    ("part_rotation", "deg"): "part rotation, deg",
-    ("part_translation", "r4"): "part translation, r4",
-}
-"""What is plotted, in this order."""
-
-BAR, EDGE, BEST, PLAIN = "#4477aa", "#222222", "#cc3311", "#bbbbbb"
-PIECES: tuple[Rung, ...] = ("pose", "parts", "joint", "state")
-
-
-def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
-    """A row per metric, a column per factor; bars with 95 % intervals, the count below each."""
-    metrics = [key for key in LABELS if any((s.metric, s.unit) == key for s in strata)]
-    names = [name for name in FACTORS if any(s.factor == name for s in strata)]
-    height = 2.3 * len(metrics) + 0.8
-    figure = Figure(figsize=(3.2 * len(names), height))
-    figure.subplots_adjust(
-        left=0.06, right=0.99, bottom=0.5 / height, top=1 - 0.8 / height, wspace=0.25, hspace=0.5
-    )
-    grid = figure.subplots(len(metrics), len(names), squeeze=False, sharey="row")
-    for row, key in enumerate(metrics):
-        for column, name in enumerate(names):
-            axes: Axes = grid[row][column]
-            bins = [s for s in strata if s.factor == name and (s.metric, s.unit) == key]
-            _bars(
-                axes,
-                [s.value for s in bins],
-                [f"{s.lower:.3g} to\n{s.upper:.3g}\nn={s.samples}" for s in bins],
-            )
-            if column == 0:
-                axes.set_ylabel(LABELS[key])
-            if row == 0:
-                axes.set_title(FACTORS[name], fontsize=9)
-    return _png(figure, title)
-
-
-def plot_ladder(ladder: dict[Rung, dict[tuple[str, str], Interval]], title: str) -> bytes:
-    """A panel per metric, a bar per rung; red is the piece whose truth helps most."""
-    metrics = [key for key in LABELS if key in ladder["predicted"]]
-    columns = -(-len(metrics) // 2)
-    figure = Figure(figsize=(3.1 * columns, 5.6))
-    figure.subplots_adjust(left=0.06, right=0.99, bottom=0.145, top=0.87, wspace=0.22, hspace=0.62)
-    grid = figure.subplots(2, columns, squeeze=False)
-    for axes in grid.flat[len(metrics) :]:
-        axes.set_axis_off()
-    for axes, key in zip(grid.flat, metrics, strict=False):
-        values: dict[Rung, Interval] = {rung: found[key] for rung, found in ladder.items()}
-        colors = {rung: BAR if rung in PIECES else PLAIN for rung in values}
-        best = helps_most(values, higher=key[0] == "iou")
-        if best is not None:
-            colors[best] = BEST
-        _bars(axes, list(values.values()), list(values), colors=list(colors.values()), turned=True)
-        if values["predicted"].count:
-            axes.axhline(values["predicted"].mean, color=EDGE, linewidth=0.7, linestyle=":")
-        axes.set_title(LABELS[key], fontsize=9)
-    return _png(figure, f"{title}: one piece replaced by the truth")
-
-
-def helps_most(values: dict[Rung, Interval], *, higher: bool) -> Rung | None:
-    """The piece whose truth improves the mean most, None where none improves it."""
-    sign = 1 if higher else -1
-    start = sign * values["predicted"].mean
-    known: list[Rung] = [rung for rung in PIECES if values[rung].count]
-    best = max(known, key=lambda rung: sign * values[rung].mean, default=None)
-    if best is None or sign * values[best].mean - start <= 1e-9:
-        return None
-    return best
-
-
-def _bars(
-    axes: Axes,
-    values: Sequence[Interval],
-    labels: Sequence[str],
-    *,
-    colors: Sequence[str] | None = None,
-    turned: bool = False,
-) -> None:
-    for place, value in enumerate(values):
-        if value.count:
-            below, above = max(0.0, value.mean - value.low), max(0.0, value.high - value.mean)
-            axes.bar(place, value.mean, color=colors[place] if colors else BAR)
-            axes.errorbar(place, value.mean, [[below], [above]], color=EDGE, capsize=2, lw=1)
-        else:
-            axes.text(place, 0, "–", ha="center", va="bottom")
-    axes.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60 if turned else 0)
-    axes.tick_params(axis="y", labelsize=7)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.margins(y=0.1)
-    axes.set_ylim(bottom=0)
-
-
-def _png(figure: Figure, title: str) -> bytes:
-    figure.suptitle(title)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110, metadata={"Software": None})
-    return buffer.getvalue()
-
 
 STRATA_COLUMNS = ("factor", "lower", "upper", "metric", "unit", "samples", "mean", "low", "high",
                   "n", "undefined")  # fmt: skip
@@ -195,27 +86,6 @@ def measure(request: Request) -> Explanation:
     )
 
 
-def explain(request: Request) -> list[Path]:
-    """Write `ladder.{md,csv,png}` and `strata.{csv,png}` to the folder `request.out`.
-
-    Raises:
-        StoreError: As `evaluate`.
-    """
-    found = measure(request)
-    contents = {
-        "ladder.md": ladder_markdown(
-            found.ladder, found.medians, found.title, found.facts
-        ).encode(),
-        "ladder.csv": _ladder_csv(found.ladder).encode(),
-        "ladder.png": plot_ladder(found.ladder, found.title),
-        "strata.csv": _strata_csv(found.strata).encode(),
-        "strata.png": plot_strata(found.strata, found.title),
-    }
-    for name, data in contents.items():
-        write_bytes(request.out / name, data)
-    return [request.out / name for name in contents]
-
-
 def _median(table: np.ndarray) -> float:
     known = table[np.isfinite(table)]
     return float(np.median(known)) if known.size else float("nan")
@@ -239,14 +109,16 @@ def _csv(columns: Iterable[str], rows: Iterable[tuple[object, ...]]) -> str:
     return buffer.getvalue()
 
 
-def _strata_csv(strata: Iterable[Stratum]) -> str:
+def strata_csv(strata: Iterable[Stratum]) -> str:
+    """A row per bin and metric."""
     return _csv(STRATA_COLUMNS, (
         (s.factor, s.lower, s.upper, s.metric, s.unit, s.samples, *_fields(s.value))
         for s in strata
     ))  # fmt: skip
 
 
-def _ladder_csv(ladder: Ladder) -> str:
+def ladder_csv(ladder: Ladder) -> str:
+    """A row per rung and metric."""
     return _csv(LADDER_COLUMNS, (
         (rung, metric, unit, *_fields(value))
         for rung, values in ladder.items() for (metric, unit), value in values.items()

@@ -12,9 +12,8 @@ rung exchanges one piece and keeps the others, so the fall of an error names wha
 - `state`: the true states, about the predicted joints.
 - `all`: everything, which scores 1 and 0 by construction.
 
-Everything is in the order of the predicted slots, calibrated as in `evaluate`.
-
-The oracle ladder as Markdown to paste: every rung, and what each metric is limited by.
+Everything is in the order of the predicted slots, calibrated as in `evaluate`. At the end the
+ladder as Markdown: every rung, and what each metric is limited by.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ from bench.scoring.scores import Errors, Frames, Rows, Settings, agreement_of, s
 from bench.scoring.truth import Truth
 from bench.statistics import Interval
 from scapo.geometry import rigid as geometry
+from scapo.text import as_markdown
 
 Rung = Literal["predicted", "recomposed", "pose", "parts", "joint", "state", "all"]
 RUNGS: tuple[Rung, ...] = get_args(Rung)
@@ -238,7 +238,7 @@ def ladder_markdown(ladder: Values, medians: Medians, title: str, facts: Mapping
     """A table `mean / median` per rung, the interval of the first, and a line per metric."""
     keys = [key for key in COLUMNS if key in ladder["predicted"]]
     lines = [
-        f"### {title}: one piece replaced by the truth",
+        f"### {as_markdown(title)}: one piece replaced by the truth",
         "",
         "Mean / median over samples and slots; lengths C, t in units of 4 x mean radius.",
         "",

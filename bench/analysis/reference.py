@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,12 +18,12 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from bench.matching import project_rotations
+from bench.requests import Kind
 from bench.scoring.predictions import Header, write_predictions
 from bench.scoring.truth import Truth, blocks, revolute
 from scapo.geometry import rigid as geometry
 from scapo.store import Arrays, Split, open_split
 
-Kind = Literal["constant", "oracle-pose"]
 TEMPLATE_CLOUDS = 50
 """Training clouds whose labelled points, in the object frame, vote for labels."""
 

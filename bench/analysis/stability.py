@@ -4,20 +4,11 @@
 Equivariance: each cloud is moved by random rigid motions, the prediction is moved back and
 compared with the prediction for the cloud as it was; `none` repeats the same cloud and shows the
 rounding. Resampling: each cloud is thinned to random subsets of its points; the scatter of the
-answers is that of the method alone, since the view stays. No truth is used.
+answers is that of the method alone, since the view stays. No truth enters.
 
-How far two answers for the same cloud differ.
-
-Numpy, camera frame, metres; answers are the tensors of a predictions file. No truth enters. The
-place of a joint axis is its point nearest to the cloud's centroid: where along the axis a method
-puts its pivot says nothing of the joint.
-
-How far several answers for the same cloud scatter, without any truth.
-
-Two statistics of the deviations, which are angles or distances: `std`, their root mean square
-about the mean (with R - 1), and `mad`, their median about the geometric median. Both are those of
-a vector, not of one coordinate: for a normal distribution with deviation s in each of two
-directions, std is 1.41 s and mad 1.18 s.
+Numpy, camera frame, metres; answers are the tensors of a predictions file. The place of a joint
+axis is its point nearest to the cloud's centroid: where along the axis a method puts its pivot
+says nothing of the joint.
 """
 
 from __future__ import annotations
@@ -37,14 +28,100 @@ from bench.scoring.scores import Errors, Rows, label_of
 from bench.statistics import BOOTSTRAP_SEED, bounds
 from scapo.paper.augment import random_pose
 
+Answer = Callable[[Float[np.ndarray, "B N 3"], Float[np.ndarray, "B 3"]], Rows]
+"""Clouds in metres and the centres of their cameras -> the tensors of a predictions file."""
 
-def centroid_and_unit(
-    points: Float[np.ndarray, "B N 3"],
-) -> tuple[Float[np.ndarray, "B 3"], Float[np.ndarray, " B"]]:
-    """Centroid of each cloud and the length of one `r4`, 4 x its mean radius."""
-    wide = points.astype(np.float64)
-    centre = wide.mean(1)
-    return centre, 4 * np.linalg.norm(wide - centre[:, None], axis=-1).mean(1)
+
+MotionKind = Literal["none", "rotation", "translation", "both"]
+
+
+MOTIONS: tuple[MotionKind, ...] = ("none", "rotation", "translation", "both")
+
+
+SHIFT = 1.0
+"""Half side of the cube of the random translations, metres."""
+
+
+POINTED = ("camera_T_part", "joint_pivot", "joint_axis")
+"""What resampling compares: one answer per cloud, whatever its points."""
+
+
+BOOTSTRAPS = 500
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """How much is measured."""
+
+    motions: int = 2
+    """Random motions of each kind for each cloud."""
+    resamplings: int = 20
+    """Random subsets of each cloud."""
+    points: int = 512
+    """Of each subset."""
+    seed: int = 0
+    """Of motions and subsets."""
+    batch: int = 32
+    """Clouds at a time."""
+
+
+class Timed:
+    """An answer that counts clouds and seconds."""
+
+    def __init__(self, answer: Answer) -> None:
+        self.answer, self.clouds, self.seconds = answer, 0, 0.0
+
+    def __call__(
+        self, points: Float[np.ndarray, "B N 3"], sensor: Float[np.ndarray, "B 3"]
+    ) -> Rows:
+        """Answer, and count."""
+        started = time.perf_counter()
+        rows = self.answer(points, sensor)
+        self.seconds += time.perf_counter() - started
+        self.clouds += len(points)
+        return rows
+
+
+def equivariance(
+    answer: Answer, points: Float[np.ndarray, "S N 3"], revolute: np.ndarray, plan: Plan
+) -> dict[MotionKind, Errors]:
+    """Changes by kind of motion: (quantity, unit) -> (S, motions * K)."""
+    still = in_batches(answer, points, np.zeros((len(points), 3), np.float32), plan.batch)
+    generator = torch.Generator().manual_seed(plan.seed)
+    out: dict[MotionKind, Errors] = {}
+    for kind in MOTIONS:
+        found: list[Errors] = []
+        for _ in range(1 if kind == "none" else plan.motions):
+            motion = random_motions(len(points), kind, generator)
+            there = points.astype(np.float64) @ np.swapaxes(motion[:, :3, :3], 1, 2)
+            there = (there + motion[:, None, :3, 3]).astype(np.float32)
+            sensor = motion[:, :3, 3].astype(np.float32)  # the camera moves with what it saw
+            back = moved(in_batches(answer, there, sensor, plan.batch), np.linalg.inv(motion))
+            found.append(changes(still, back, points, revolute))
+        out[kind] = {key: np.concatenate([item[key] for item in found], 1) for key in found[0]}
+    return out
+
+
+def random_motions(
+    count: int, kind: MotionKind, generator: torch.Generator
+) -> Float[np.ndarray, "B 4 4"]:
+    """Rotations uniform on SO(3) about the camera, translations uniform in a cube."""
+    like = torch.zeros(0, dtype=torch.float64)
+    motion = random_pose(count, SHIFT, generator, like).numpy()
+    if kind in ("none", "translation"):
+        motion[:, :3, :3] = np.eye(3)
+    if kind in ("none", "rotation"):
+        motion[:, :3, 3] = 0
+    return motion
+
+
+def in_batches(
+    answer: Answer, points: Float[np.ndarray, "S N 3"], sensor: Float[np.ndarray, "S 3"], batch: int
+) -> Rows:
+    """The answers for all clouds."""
+    starts = range(0, len(points), batch)
+    pieces = [answer(points[k : k + batch], sensor[k : k + batch]) for k in starts]
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
 
 def moved(rows: Rows, motion: Float[np.ndarray, "B 4 4"]) -> Rows:
@@ -58,15 +135,6 @@ def moved(rows: Rows, motion: Float[np.ndarray, "B 4 4"]) -> Rows:
     if "joint_axis" in rows:
         out["joint_axis"] = (turn @ rows["joint_axis"][..., None])[..., 0]
     return out
-
-
-def axis_places(rows: Rows, centre: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B J 3"]:
-    """The point of each joint axis nearest to `centre`."""
-    pivot, axis = (
-        rows["joint_pivot"].astype(np.float64),
-        unit(rows["joint_axis"].astype(np.float64)),
-    )
-    return pivot + axis * ((centre[:, None] - pivot) * axis).sum(-1, keepdims=True)
 
 
 def changes(
@@ -120,14 +188,62 @@ def _states(
     return out
 
 
+def axis_places(rows: Rows, centre: Float[np.ndarray, "B 3"]) -> Float[np.ndarray, "B J 3"]:
+    """The point of each joint axis nearest to `centre`."""
+    pivot, axis = (
+        rows["joint_pivot"].astype(np.float64),
+        unit(rows["joint_axis"].astype(np.float64)),
+    )
+    return pivot + axis * ((centre[:, None] - pivot) * axis).sum(-1, keepdims=True)
+
+
+def centroid_and_unit(
+    points: Float[np.ndarray, "B N 3"],
+) -> tuple[Float[np.ndarray, "B 3"], Float[np.ndarray, " B"]]:
+    """Centroid of each cloud and the length of one `r4`, 4 x its mean radius."""
+    wide = points.astype(np.float64)
+    centre = wide.mean(1)
+    return centre, 4 * np.linalg.norm(wide - centre[:, None], axis=-1).mean(1)
+
+
+def resampled(
+    answer: Answer, points: Float[np.ndarray, "S N 3"], plan: Plan
+) -> dict[tuple[str, str, str], np.ndarray]:
+    """Scatter over random subsets of each cloud, drawn without replacement.
+
+    Raises:
+        ValueError: The clouds have no more points than a subset.
+    """
+    count, total, _ = points.shape
+    if not 0 < plan.points < total:
+        raise ValueError(
+            f"resampling: expected 1 to {total - 1} of the clouds' {total} points, "
+            f"found {plan.points}"
+        )
+    generator = np.random.default_rng(plan.seed)
+    answers: list[Rows] = []
+    for _ in range(plan.resamplings):
+        chosen = generator.permuted(np.tile(np.arange(total), (count, 1)), axis=1)
+        subset = np.take_along_axis(points, chosen[:, : plan.points, None], 1)
+        rows = in_batches(answer, subset, np.zeros((count, 3), np.float32), plan.batch)
+        answers.append({name: rows[name] for name in POINTED if name in rows})
+    return scatter(answers, points)
+
+
 Scatter = dict[tuple[str, str, str], np.ndarray]
 """(quantity, unit, `std` or `mad`) -> (B, K); NaN where an answer is missing."""
+
 
 Distance = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def scatter(answers: Sequence[Rows], points: Float[np.ndarray, "B N 3"]) -> Scatter:
     """Spread of R answers for the same clouds.
+
+    Two statistics of the deviations, which are angles or distances: `std`, their root mean square
+    about the mean (with R - 1), and `mad`, their median about the geometric median. Both are those
+    of a vector, not of one coordinate: for a normal distribution with deviation s in each of two
+    directions, std is 1.41 s and mad 1.18 s.
 
     Args:
         answers: `camera_T_part`, `joint_pivot` and `joint_axis` where a method has them, all in
@@ -192,117 +308,6 @@ def _named(name: str, label: str, found: dict[str, np.ndarray]) -> Scatter:
 
 def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a - b, axis=-1)
-
-
-MotionKind = Literal["none", "rotation", "translation", "both"]
-MOTIONS: tuple[MotionKind, ...] = ("none", "rotation", "translation", "both")
-SHIFT = 1.0
-"""Half side of the cube of the random translations, metres."""
-BOOTSTRAPS = 500
-POINTED = ("camera_T_part", "joint_pivot", "joint_axis")
-"""What resampling compares: one answer per cloud, whatever its points."""
-
-Answer = Callable[[Float[np.ndarray, "B N 3"], Float[np.ndarray, "B 3"]], Rows]
-"""Clouds in metres and the centres of their cameras -> the tensors of a predictions file."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """How much is measured."""
-
-    motions: int = 2
-    """Random motions of each kind for each cloud."""
-    resamplings: int = 20
-    """Random subsets of each cloud."""
-    points: int = 512
-    """Of each subset."""
-    seed: int = 0
-    """Of motions and subsets."""
-    batch: int = 32
-    """Clouds at a time."""
-
-
-def equivariance(
-    answer: Answer, points: Float[np.ndarray, "S N 3"], revolute: np.ndarray, plan: Plan
-) -> dict[MotionKind, Errors]:
-    """Changes by kind of motion: (quantity, unit) -> (S, motions * K)."""
-    still = in_batches(answer, points, np.zeros((len(points), 3), np.float32), plan.batch)
-    generator = torch.Generator().manual_seed(plan.seed)
-    out: dict[MotionKind, Errors] = {}
-    for kind in MOTIONS:
-        found: list[Errors] = []
-        for _ in range(1 if kind == "none" else plan.motions):
-            motion = random_motions(len(points), kind, generator)
-            there = points.astype(np.float64) @ np.swapaxes(motion[:, :3, :3], 1, 2)
-            there = (there + motion[:, None, :3, 3]).astype(np.float32)
-            sensor = motion[:, :3, 3].astype(np.float32)  # the camera moves with what it saw
-            back = moved(in_batches(answer, there, sensor, plan.batch), np.linalg.inv(motion))
-            found.append(changes(still, back, points, revolute))
-        out[kind] = {key: np.concatenate([item[key] for item in found], 1) for key in found[0]}
-    return out
-
-
-def random_motions(
-    count: int, kind: MotionKind, generator: torch.Generator
-) -> Float[np.ndarray, "B 4 4"]:
-    """Rotations uniform on SO(3) about the camera, translations uniform in a cube."""
-    like = torch.zeros(0, dtype=torch.float64)
-    motion = random_pose(count, SHIFT, generator, like).numpy()
-    if kind in ("none", "translation"):
-        motion[:, :3, :3] = np.eye(3)
-    if kind in ("none", "rotation"):
-        motion[:, :3, 3] = 0
-    return motion
-
-
-def resampled(
-    answer: Answer, points: Float[np.ndarray, "S N 3"], plan: Plan
-) -> dict[tuple[str, str, str], np.ndarray]:
-    """Scatter over random subsets of each cloud, drawn without replacement.
-
-    Raises:
-        ValueError: The clouds have no more points than a subset.
-    """
-    count, total, _ = points.shape
-    if not 0 < plan.points < total:
-        raise ValueError(
-            f"resampling: expected 1 to {total - 1} of the clouds' {total} points, "
-            f"found {plan.points}"
-        )
-    generator = np.random.default_rng(plan.seed)
-    answers: list[Rows] = []
-    for _ in range(plan.resamplings):
-        chosen = generator.permuted(np.tile(np.arange(total), (count, 1)), axis=1)
-        subset = np.take_along_axis(points, chosen[:, : plan.points, None], 1)
-        rows = in_batches(answer, subset, np.zeros((count, 3), np.float32), plan.batch)
-        answers.append({name: rows[name] for name in POINTED if name in rows})
-    return scatter(answers, points)
-
-
-def in_batches(
-    answer: Answer, points: Float[np.ndarray, "S N 3"], sensor: Float[np.ndarray, "S 3"], batch: int
-) -> Rows:
-    """The answers for all clouds."""
-    starts = range(0, len(points), batch)
-    pieces = [answer(points[k : k + batch], sensor[k : k + batch]) for k in starts]
-    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
-
-
-class Timed:
-    """An answer that counts clouds and seconds."""
-
-    def __init__(self, answer: Answer) -> None:
-        self.answer, self.clouds, self.seconds = answer, 0, 0.0
-
-    def __call__(
-        self, points: Float[np.ndarray, "B N 3"], sensor: Float[np.ndarray, "B 3"]
-    ) -> Rows:
-        """Answer, and count."""
-        started = time.perf_counter()
-        rows = self.answer(points, sensor)
-        self.seconds += time.perf_counter() - started
-        self.clouds += len(points)
-        return rows
 
 
 def summary(values: np.ndarray, instance: Int[np.ndarray, " S"]) -> dict[str, Any]:

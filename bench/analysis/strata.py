@@ -17,6 +17,7 @@ from scapo.store.manifest import Manifest
 
 QUANTILES = 5
 STATE_EDGES = np.linspace(0, 1, 6)
+AMBIGUOUS_EDGES = np.array([0.0, 0.5, 1.0])
 AZIMUTH_EDGES = np.arange(-180, 181, 45.0)
 ELEVATION_EDGES = np.arange(-90, 91, 30.0)
 
@@ -26,26 +27,31 @@ FACTORS = {
     "azimuth": "camera azimuth, deg, 0 = front",
     "elevation": "camera elevation, deg",
     "size": "size, m (4 x mean radius)",
+    "ambiguous": "0 one pose explains it, 1 several",
 }
-"""Factor -> what it is; with several moving parts the mean over them."""
+"""Factor -> what it is; with several moving parts the mean over them. `ambiguous` is there where
+the data say so."""
 
 
 def factors(truth: Truth, manifest: Manifest) -> dict[str, Float[np.ndarray, " B"]]:
     """The value of every factor for some samples.
 
-    Azimuth and elevation are those of the camera about the object's origin (`types.Window`).
+    Azimuth and elevation are those of the camera about the object's origin (`categories.Window`).
     """
     upper = np.array([max(joint.upper, 1e-12) for joint in manifest.joints])
     pose = truth.camera_T_part[:, 0]
     camera = -np.einsum("bij,bi->bj", pose[:, :3, :3], pose[:, :3, 3])  # in the object frame
     x, y, z = camera.T
-    return {
+    values = {
         "visible": truth.visible[:, 1:].mean(1),
         "state": (truth.joint_state / upper).mean(1),
         "azimuth": np.degrees(np.arctan2(-y, -x)),
         "elevation": np.degrees(np.arctan2(z, np.hypot(x, y))),
         "size": truth.scale,
     }
+    if truth.alike is not None:
+        values["ambiguous"] = truth.alike.turns[:, 1:].any(1).astype(np.float64)
+    return values
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +69,12 @@ class Stratum:
 
 def edges(factor: str, values: Float[np.ndarray, " B"]) -> Float[np.ndarray, " E"]:
     """Limits of the bins: fixed for angles and states, five equal counts for the others."""
-    fixed = {"state": STATE_EDGES, "azimuth": AZIMUTH_EDGES, "elevation": ELEVATION_EDGES}
+    fixed = {
+        "state": STATE_EDGES,
+        "azimuth": AZIMUTH_EDGES,
+        "elevation": ELEVATION_EDGES,
+        "ambiguous": AMBIGUOUS_EDGES,
+    }
     if factor in fixed:
         return fixed[factor]
     return np.unique(np.quantile(values, np.linspace(0, 1, QUANTILES + 1)))

@@ -3,19 +3,21 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
 from bench.analysis.ladder import COLUMNS
-from bench.scoring.score_files import read_scores, side_file
+from bench.scoring.score_files import read_report, read_scores
 from scapo.store import write_bytes
+from scapo.store.json_records import from_json, read_json
 from scapo.store.provenance import commit
+from scapo.text import as_markdown, one_line
 
 PAGE = "README.md"
 METRICS = (
@@ -41,11 +43,41 @@ class Entry:
     pictures: Path
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """One number of a stability report; its interval is left alone."""
+
+    value: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Statistic:
+    """Changes of one quantity; None where nothing is defined."""
+
+    median: Point | None = None
+    p95: Point | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModeStability:
+    """One inference mode in a stability report."""
+
+    equivariance: dict[str, dict[str, Statistic]]
+    resampling: dict[str, Statistic] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stability:
+    """What the page takes from a stability report."""
+
+    modes: dict[str, ModeStability]
+
+
 def write_page(out: Path, entries: Iterable[Entry], command: str) -> Path:
     """Write the page from the files of the study; returns its path."""
     entries = list(entries)
     headings = [COLUMNS[key][0] for key in METRICS]
-    lines = ["# Results", "", f"`{command}`, code {commit()}", "",
+    lines = ["# Results", "", f"`{one_line(command).replace('`', '')}`, code {commit()}", "",
              "Mean [95 % interval, resampled by instance] and median; C, t in 4 x mean radius. "
              "Clouds per second in batches on the machine named below.", "",
              _row(["run", "mode", *headings, "clouds/s"]),
@@ -56,7 +88,7 @@ def write_page(out: Path, entries: Iterable[Entry], command: str) -> Path:
               _row(["---"] * 7)]  # fmt: skip
     lines += [_row(_origin(entry)) for entry in entries]
     for entry in entries:
-        lines += ["", f"## {entry.name}", "", *_figures(out, entry)]
+        lines += ["", f"## {as_markdown(entry.name)}", "", *_figures(out, entry)]
         if entry.ladder.is_file():
             lines += ["", entry.ladder.read_text().strip()]
     write_bytes(out / PAGE, ("\n".join(lines) + "\n").encode())
@@ -64,34 +96,40 @@ def write_page(out: Path, entries: Iterable[Entry], command: str) -> Path:
 
 
 def _scores_row(entry: Entry) -> list[str]:
-    report = _json(side_file(entry.scores))
-    (scores,) = read_scores(entry.scores)
+    scores = read_scores(entry.scores)[0]
     cells = []
     for key in METRICS:
         _, factor, decimals = COLUMNS[key]
-        row, values = report["summary"]["_".join(key)], scores.errors[key]
-        if row["mean"] is None:
+        row, values = scores.report.summary.get("_".join(key)), scores.errors.get(key)
+        if row is None or row.mean is None or values is None or not np.isfinite(values).any():
             cells.append("–")
             continue
         mean, low, high, median = (
-            f"{factor * value:.{decimals}f}"
-            for value in (row["mean"], row["low"], row["high"], np.nanmedian(values))
+            "–" if value is None else f"{factor * value:.{decimals}f}"
+            for value in (row.mean, row.low, row.high, np.nanmedian(values))
         )
         cells.append(f"{mean} [{low}, {high}] {median}")
-    seconds = report["budget"].get("seconds_per_cloud")
+    seconds = _positive(scores.report.budget, "seconds_per_cloud")
     return [_run(entry), entry.mode, *cells, f"{1 / seconds:.1f}" if seconds else "–"]
 
 
+def _positive(budget: Mapping[str, Any], name: str) -> float | None:
+    """A number of the budget, which is as the predictions' writer has it: anything."""
+    value = budget.get(name)
+    return value if isinstance(value, (int, float)) and 0 < value < 1e15 else None
+
+
 def _origin(entry: Entry) -> list[str]:
-    report = _json(side_file(entry.scores))
-    run, budget = report.get("run") or {}, report["budget"]
-    trained = budget.get("training_seconds")
-    device = run.get("machine") or {}
+    report = read_report(entry.scores)
+    run, budget = report.run, report.budget
+    trained = _positive(budget, "training_seconds")
+    found = run.get("machine")
+    device: dict[str, Any] = found if isinstance(found, dict) else {}
+    size = int(_positive(budget, "parameters") or 0)
     return [
-        _run(entry), entry.mode, str(report["seed"]),
-        "–" if trained is None else f"{trained / 60:.1f} min, {budget.get('parameters', 0):,} "
-        "parameters",
-        str(report["data"]), str(run.get("commit", "–")),
+        _run(entry), entry.mode, str(report.seed),
+        "–" if trained is None else f"{trained / 60:.1f} min, {size:,} parameters",
+        report.data, str(run.get("commit", "–")),
         f"{device.get('cpu', '–')}, {device.get('cores', '–')} cores, {budget.get('device', '–')}",
     ]  # fmt: skip
 
@@ -99,8 +137,8 @@ def _origin(entry: Entry) -> list[str]:
 def _stability(out: Path) -> list[str]:
     rows = []
     for path in sorted((out / "stability").glob("*.json")):
-        for mode, found in _json(path)["modes"].items():
-            moved, drawn = found["equivariance"]["both"], found.get("resampling", {})
+        for mode, found in from_json(Stability, read_json(path), str(path)).modes.items():
+            moved, drawn = found.equivariance.get("both", {}), found.resampling
             cells = [_pair(moved.get(name)) for name in MOVED.values()]
             cells += [_pair(drawn.get(name)) for name in SCATTERED.values()]
             rows.append(_row([path.stem, mode, *cells]))
@@ -115,15 +153,15 @@ def _stability(out: Path) -> list[str]:
             *rows]  # fmt: skip
 
 
-def _pair(row: dict[str, Any] | None) -> str:
-    if row is None or "median" not in row:
+def _pair(row: Statistic | None) -> str:
+    if row is None or row.median is None or row.p95 is None:
         return "–"
-    return f"{row['median']['value']:.3g} / {row['p95']['value']:.3g}"
+    return f"{row.median.value:.3g} / {row.p95.value:.3g}"
 
 
 def _figures(out: Path, entry: Entry) -> list[str]:
     paths = [(name, entry.pictures / f"{name}.png") for name in FIGURES]
-    return [f"![{name}]({Path(os.path.relpath(path, out)).as_posix()})"
+    return [f"![{name}]({quote(Path(os.path.relpath(path, out)).as_posix())})"
             for name, path in paths if path.is_file()]  # fmt: skip
 
 
@@ -131,9 +169,5 @@ def _run(entry: Entry) -> str:
     return entry.name.removesuffix(f"-{entry.mode}")
 
 
-def _json(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text())
-
-
 def _row(cells: Iterable[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    return f"| {' | '.join(map(as_markdown, cells))} |"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ICP against a few labelled training shapes: the classical baseline (PROTOCOL 3.6).
+"""ICP against a few labelled training shapes: the classical baseline (docs/protocol.md).
 
 Two ways, because the paper's row mixes what one cannot give. As it stands, the whole cloud is
 registered to whole templates, copies the labels of the nearest template points, and each part
@@ -23,9 +23,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from scapo.categories import Category
 from scapo.geometry.points import MEAN_RADIUS, normalise
 from scapo.method import Mode, OracleMethod, Stage, Step
-from scapo.types import Category, Labels, Observation, Prediction, Supervision
+from scapo.types import Labels, Observation, Prediction, Supervision
 
 Points = Float[np.ndarray, "N 3"]
 Pose = Float[np.ndarray, "4 4"]

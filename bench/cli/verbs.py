@@ -1,78 +1,71 @@
 # SPDX-License-Identifier: MIT
-"""The verbs of `scapo-bench`: one dataclass each, whose fields are the flags."""
+"""The verbs of `scapo-bench`: one dataclass each, whose fields are the flags.
+
+A verb asks one function of its room, which is imported only then, and prints the answer.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
-from bench.analysis.explain import explain
-from bench.analysis.reference import Kind, write_reference
-from bench.cli.pictures import Pictures
-from bench.cli.stability import Stability
-from bench.cli.study import Study
+from bench import requests
+from bench.cli.console import say, stability_tables, stage_bars, summary_table, watched
 from bench.metrics import ApRule
-from bench.scoring.evaluate import Request, evaluate
-from bench.scoring.score_files import side_file
-from bench.scoring.scores import Settings
-from bench.tables.paper import check
-from bench.tables.results import load
-from bench.tables.write import write
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evaluate:
+class Train(requests.TrainRequest[requests.M]):
+    """Fit a method to one category; the run folder keeps config, log, curve and checkpoint."""
+
+    def run(self, console: Console) -> None:
+        """Fit it, with a progress bar, and name checkpoint and report."""
+        from bench.runs.train import train
+
+        with stage_bars(console) as listener:
+            written = train(self, lambda line: say(console, line), listener)
+        if written is not None:
+            say(console, f"Run: {', '.join(map(str, written))}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Predict(requests.PredictRequest):
+    """Predict parts, poses and joints of every cloud of a split."""
+
+    def run(self, console: Console) -> None:
+        """Write the file, and say how long a cloud took."""
+        from bench.runs.predict import predict
+
+        count, seconds = predict(self, watched(console, "predict"))
+        say(console, f"{count} clouds, {1000 * seconds:.1f} ms each: {self.out}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluate(requests.Request):
     """Score a predictions file, written by any program, against the data it was made on."""
 
-    predictions: Path
-    """Predictions (safetensors, docs/bring-your-own-method.md)."""
-    data: Path
-    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
     out: Path
     """Scores per sample, NAME.csv.gz; the report NAME.json is written beside it."""
-    split: str = "test"
-    """Split that was predicted."""
-    calibration: Path | None = None
-    """Predictions of the same run on the training split, to fit the frames of a method that saw
-    no poses. Without it poses are compared as given."""
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+    settings: Annotated[requests.Settings, tyro.conf.arg(name="")] = field(
+        default_factory=requests.Settings
+    )
 
     def run(self, console: Console) -> None:
         """Score and print the means."""
-        report = evaluate(
-            Request(
-                predictions=self.predictions,
-                data=self.data,
-                out=self.out,
-                split=self.split,
-                calibration=self.calibration,
-                settings=self.settings,
-            )
-        )
+        from bench.scoring.evaluate import evaluate
+        from bench.scoring.score_files import side_file
+
+        report = evaluate(self)
         if self.calibration is None and "pose" not in report["supervision"]:
-            console.print("No --calibration: part poses are compared as given.")
-        table = Table(
-            title=f"{report['method']} {report['category']} {report['split']}, "
-            f"{report['counts']['samples']} samples"
-        )
-        for heading in ("metric", "mean", "95 % interval", "undefined"):
-            table.add_column(heading, justify="left" if heading == "metric" else "right")
-        for name, row in report["summary"].items():
-            metric, unit = name.rsplit("_", 1)
-            known = row["mean"] is not None
-            table.add_row(
-                f"{metric}, {unit}" if unit != "1" else metric,
-                f"{row['mean']:.4g}" if known else "–",
-                f"{row['low']:.4g} to {row['high']:.4g}" if known else "–",
-                str(row["undefined"]),
-            )
-        console.print(table)
-        console.print(f"Scores: {self.out}\nReport: {side_file(self.out)}", soft_wrap=True)
+            say(console, "No --calibration: part poses are compared as given.")
+        console.print(summary_table(report))
+        say(console, f"Scores: {self.out}")
+        say(console, f"Report: {side_file(self.out)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,40 +84,71 @@ class Tables:
 
     def run(self, console: Console) -> None:
         """Write the tables, or check the printed ones."""
-        lines = check() if self.check_paper else [
-            str(path) for path in write(load(self.scores), self.out, self.ap_rule)
-        ]  # fmt: skip
-        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+        from bench.tables.paper import check
+        from bench.tables.write import make_tables
+
+        lines = check() if self.check_paper else make_tables(self.scores, self.out, self.ap_rule)
+        for line in lines:
+            say(console, line)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Explain:
+class Explain(requests.Request):
     """Why a method fails: errors by what was seen, and with one piece replaced by the truth."""
 
-    predictions: Path
-    """Predictions (safetensors)."""
-    data: Path
-    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
     out: Path
     """Folder for ladder.md, ladder.csv, ladder.png, strata.csv and strata.png."""
-    split: str = "test"
-    """Split that was predicted."""
-    calibration: Path | None = None
-    """Predictions of the same run on the training split, as for evaluate."""
 
     def run(self, console: Console) -> None:
         """Write the files and print their names."""
-        request = Request(predictions=self.predictions, data=self.data, out=self.out,
-                          split=self.split, calibration=self.calibration)  # fmt: skip
-        for path in explain(request):
-            console.print(str(path), markup=False, highlight=False, soft_wrap=True)
+        from bench.figures.explain import explain
+
+        for path in explain(self):
+            say(console, path)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stability(requests.StabilityRequest):
+    """Does the prediction move with the cloud, and does it stay when points are drawn again?"""
+
+    def run(self, console: Console) -> None:
+        """Measure, print tables, and name the report."""
+        from bench.runs.stability import measure_stability
+
+        for table in stability_tables(measure_stability(self)):
+            console.print(table)
+        say(console, f"Report: {self.out}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pictures(requests.PicturesRequest):
+    """Figures of a run: clouds in one frame, its template, best to worst, the training curve."""
+
+    def run(self, console: Console) -> None:
+        """Draw what the run has, and say what it has not."""
+        from bench.figures.run import draw_pictures
+
+        for line in draw_pictures(self):
+            say(console, line)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study(requests.StudyRequest):
+    """Predict, score, explain, draw and test the stability of runs; one page of all results."""
+
+    def run(self, console: Console) -> None:
+        """Do what is missing, naming each file, then write the page anew."""
+        from bench.runs.study import study
+
+        page = study(self, lambda line: say(console, line), watched(console, "predict"))
+        say(console, f"Page: {page}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reference:
     """Write the predictions of a constant answer, or of one that is told the true base pose."""
 
-    kind: tyro.conf.Positional[Kind]
+    kind: tyro.conf.Positional[requests.Kind]
     """Which of the two."""
     data: Path
     """Data set: the folder above CATEGORY/train and CATEGORY/SPLIT."""
@@ -137,11 +161,15 @@ class Reference:
 
     def run(self, console: Console) -> None:
         """Write the file."""
+        from bench.analysis.reference import write_reference
+
         write_reference(self.kind, self.data, self.category, self.out, split=self.split)
-        console.print(str(self.out), markup=False, highlight=False, soft_wrap=True)
+        say(console, self.out)
 
 
-VERBS: dict[str, type] = {
+VERBS: dict[str, Any] = {
+    "train": Train[tuple[()]],
+    "predict": Predict,
     "evaluate": Evaluate,
     "tables": Tables,
     "explain": Explain,
@@ -150,4 +178,34 @@ VERBS: dict[str, type] = {
     "study": Study,
     "reference": Reference,
 }
-"""In the order of the help."""
+"""In the order of the help, where `train` stands without its methods."""
+
+
+def train_verb(preset: str | None) -> Any:  # noqa: ANN401 - a type made at run time
+    """`Train` over all methods, their flags defaulting to the preset of that name."""
+    from bench.methods import all_methods
+
+    methods = [
+        Annotated[entry.kind, tyro.conf.subcommand(name, default=entry.preset(preset))]
+        for name, entry in all_methods().items()
+    ]
+    return Train[Union[tuple(methods)]]  # noqa: UP007 - the tuple is not known to the type checker
+
+
+def prepare(arguments: Sequence[str]) -> tuple[list[str], str | None]:
+    """Words for tyro, and the preset that `--preset` names.
+
+    The preset decides the other flags' defaults, so it is looked up before they are parsed.
+    `--supervision` takes its labels with commas as well as with spaces.
+
+    >>> prepare(["train", "scapo", "--preset", "cpu", "--supervision", "segmentation,joint"])
+    (['train', 'scapo', '--preset', 'cpu', '--supervision', 'segmentation', 'joint'], 'cpu')
+    """
+    words: list[str] = []
+    for word in arguments:
+        flag, _, value = word.partition("=")
+        words += [flag, value] if flag in ("--preset", "--supervision") and value else [word]
+    pairs = list(zip(["", *words], words, strict=False))
+    preset = next((word for before, word in pairs if before == "--preset"), None)
+    split = [word.split(",") if before == "--supervision" else [word] for before, word in pairs]
+    return [piece for pieces in split for piece in pieces], preset

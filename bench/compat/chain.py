@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""OP-Align's maps between the aligned input, the canonical shape and the input (PROTOCOL 1.6)."""
+"""OP-Align's maps between the aligned input, the canonical shape and the input."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Chain:
     revolute: bool
     corrected: bool
     """Translations rotated and the third part kept; otherwise as released. The clamp of
-    `dir_to_dir_rotation` stays in both, as in the corrected evaluator of PROTOCOL 1.6."""
+    `dir_to_dir_rotation` stays in both, as in the corrected evaluator."""
 
 
 def exp_so3(rotvec: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3 3"]:
@@ -96,7 +96,7 @@ def _through_blocks(
 ) -> tuple[Float[np.ndarray, "B P 3 3"], Float[np.ndarray, "B P 3"]]:
     """Every part through its joint; the base of three parts is the average of both joints.
 
-    As released, the third of three parts is then the base seen through joint 1 (PROTOCOL 1.6 b).
+    As released, the third of three parts is then the base seen through joint 1 (docs/protocol.md).
     """
     turns = [turn @ rotation[:, part] for part, turn, _, _ in blocks]
     moves = [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The published evaluators' readings, for comparison with printed numbers only (PROTOCOL 1).
+"""The published evaluators' readings, for comparison with printed numbers only (docs/protocol.md).
 
 `opalign` follows the released OP-Align evaluation (commit f3323dd) including its defects: part
 translations are not rotated, the third part is the base seen through joint 1, prismatic states
@@ -51,7 +51,7 @@ SYMMETRY: dict[str, tuple[tuple[int, int, int], ...]] = {
     "laptop_output": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
     "suitcase_output": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
 }
-"""Rotation of the true poses of swapped samples by OP-Align's category id (PROTOCOL 1.2)."""
+"""Rotation of the true poses of swapped samples by OP-Align's category id (docs/protocol.md)."""
 
 RECORD = (
     "R_select",
@@ -77,7 +77,7 @@ def opalign(
     ransac_seed: int | None = None,
     geometry: Geometry = "compat",
 ) -> dict[str, Any]:
-    """OP-Align's evaluation of network outputs (PROTOCOL 1.2 to 1.6).
+    """OP-Align's evaluation of network outputs (docs/protocol.md).
 
     Args:
         record: Always `gt_pose` (B,P,4,4), `gt_joint` (B,J,6: pivot, direction), `gt_seg` (B,N),
@@ -161,7 +161,7 @@ def _rows(record: Mapping[str, Any], rows: slice) -> dict[str, Any]:
 def _reorder(
     record: Mapping[str, Any],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """True poses, joints, labels in the predicted order; and which points count (PROTOCOL 1.2)."""
+    """True poses, joints, labels in the predicted order; and which points count."""
     pose, joint = _float(record["gt_pose"]).copy(), _float(record["gt_joint"]).copy()
     label = np.asarray(record["gt_seg"]).astype(np.int64)
     first = 1 if bool(record.get("background", False)) else 0
@@ -197,7 +197,7 @@ def _score(
     pose: tuple[np.ndarray, np.ndarray],
     joints: tuple[np.ndarray, np.ndarray],
 ) -> dict[str, Any]:
-    """PROTOCOL 1.3 to 1.5 in the published reading."""
+    """Segmentation, joints and poses in the published reading."""
     true_pose, true_joint, label, known = _reorder(record)
     expand = _float(record["expand"])[:, None] if _scaled(record) else 1.0
     axis, pred_axis = unit(true_joint[..., 3:]), unit(joints[1])

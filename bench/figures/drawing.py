@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Shapes of an object frame seen from a chosen side, and what all figures share."""
+"""What all figures share: shapes seen from a chosen side, legends, text, PNG files."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +13,12 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 
 from scapo.drawing import BACKGROUND, PART_COLORS
+from scapo.store import write_bytes
+from scapo.text import one_line
 
 PALETTE = np.array([to_rgb(name) for name in (*PART_COLORS, BACKGROUND)])
 """RGB per part; the last row, index -1, is background."""
@@ -97,7 +102,15 @@ def window(axes: Axes, half: float) -> None:
 def part_legend(figure: Figure, parts: Sequence[str], y: float) -> None:
     """The parts' colours and names in a row, centred at height `y` of the figure."""
     handles = [
-        Line2D([], [], marker="o", linestyle="", markersize=5, color=tuple(PALETTE[p]), label=name)
+        Line2D(
+            [],
+            [],
+            marker="o",
+            linestyle="",
+            markersize=5,
+            color=tuple(PALETTE[p]),
+            label=plain(name),
+        )
         for p, name in enumerate(parts)
     ]
     handles.append(Line2D([], [], color=LINE, linewidth=1.4, label="joint axis"))
@@ -105,3 +118,22 @@ def part_legend(figure: Figure, parts: Sequence[str], y: float) -> None:
         handles=handles, loc="center", bbox_to_anchor=(0.5, y), ncols=len(handles),
         frameon=False, fontsize=8, handletextpad=0.4, columnspacing=1.4,
     )  # fmt: skip
+
+
+def plain(name: str, longest: int = 200) -> str:
+    """A name from a file as text of a figure: one line, no formula, boxes for unknown signs."""
+    font = get_font(findfont(FontProperties()))
+    line = "".join(c if font.get_char_index(ord(c)) else "□" for c in one_line(name, longest))
+    return line.replace("$", r"\$")
+
+
+def to_png(figure: Figure, **options: Any) -> bytes:  # noqa: ANN401 - of `savefig`
+    """The figure as PNG; the same figure is the same bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None}, **options)
+    return buffer.getvalue()
+
+
+def save(figure: Figure, out: Path) -> None:
+    """Write a PNG under its final name only when complete."""
+    write_bytes(out, to_png(figure))

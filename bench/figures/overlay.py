@@ -18,10 +18,11 @@ from bench.figures.drawing import (
     draw_points,
     look,
     part_legend,
+    plain,
+    save,
     transform,
     window,
 )
-from bench.figures.pictures import save
 
 VIEWS = {"from the front, above": (35.0, 28.0), "from the side": (90.0, 0.0),
          "from above": (0.0, 89.9)}  # fmt: skip
@@ -65,8 +66,8 @@ def caption(answered: Answered, samples: Int[np.ndarray, " K"]) -> str:
     """What is drawn, and how well the bases of all answered samples agree with the truth."""
     error = answered.errors["part_rotation", "deg"][:, 0]
     error = error[np.isfinite(error)]
-    words = f"{answered.header.method} {answered.header.variant}".strip()
-    first = f"{words}: {len(samples)} {answered.header.category} clouds in one frame"
+    words = plain(f"{answered.header.method} {answered.header.variant}".strip())
+    first = f"{words}: {len(samples)} {plain(answered.header.category)} clouds in one frame"
     if answered.fitted.frames.offsets is None and "pose" not in answered.header.supervision:
         return f"{first} (not calibrated)"
     share = 100 * float((error <= 15).mean()) if len(error) else float("nan")

@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Pictures of what a method did: predictions beside the truth, and training curves, as PNG.
-
-Test predictions from the best to the worst, at even steps of their rank.
-"""
+"""Predictions beside the truth, from the best to the worst, and the curves of a training."""
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bench.analysis.answered import Answered
+from bench.figures.drawing import plain, save
 from bench.metrics import sample_errors
+from bench.run_files import read_metrics
+from bench.scoring.predictions import read_prediction_header
 from bench.scoring.scores import Errors
 from scapo import store
 from scapo.drawing import draw_axis, draw_cloud
@@ -59,7 +57,8 @@ def predictions_picture(
     """
     index = np.asarray(samples)
     truth = {name: array[index] for name, array in split.arrays(*NAMES).items()}
-    predicted, header = store.read(predictions, store.PREDICTIONS)
+    header = read_prediction_header(predictions)
+    predicted, _ = store.read(predictions, store.PREDICTIONS)
     predicted = {name: array[index] for name, array in predicted.items()}
     part_true = np.where(truth["part"] == UNLABELLED, -1, truth["part"].astype(np.int64))
     part_shown = as_compared(truth, part_true, hard_parts(predicted))
@@ -76,8 +75,8 @@ def predictions_picture(
             draw_joints(axes, points, truth, number, color=TRUE_AXIS)
         draw_joints(below, points, predicted, number, color=PREDICTED_AXIS)
         above.set_title(titles[number] if titles else f"#{sample}", fontsize=8)
-    words = f"{header['method']} {header.get('variant', '')}".strip()
-    _finish(figure, grid, heading or f"{words}, {header['category']}")
+    words = f"{header.method} {header.variant}".strip()
+    _finish(figure, grid, plain(heading or f"{words}, {header.category}"))
     save(figure, out)
 
 
@@ -130,11 +129,10 @@ def hard_parts(predicted: store.Arrays) -> np.ndarray:
 def training_curve(metrics: Path, out: Path) -> None:
     """Loss terms of a run's metrics.jsonl against the step, one panel per stage."""
     stages: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
-    for line in metrics.read_text().splitlines():
-        row = json.loads(line)
+    for row in read_metrics(metrics):
         for name, value in row.items():
-            if name.startswith("loss") and isinstance(value, float):
-                stages[str(row.get("stage", ""))][name].append((row["step"], value))
+            if name.startswith("loss"):
+                stages[row["stage"]][name].append((row["step"], value))
     figure = Figure(figsize=(5 * max(1, len(stages)), 4.4), dpi=130)
     panels = figure.subplots(1, max(1, len(stages)), squeeze=False)[0]
     for panel, (stage, terms) in zip(panels, stages.items(), strict=False):
@@ -144,10 +142,11 @@ def training_curve(metrics: Path, out: Path) -> None:
             panel.plot(
                 steps, values, linewidth=2 if total else 1.1,
                 color="black" if total else f"C{(number - 1) % 10}",
-                linestyle="-" if number <= 10 else "--", label=name.removeprefix("loss/"),
+                linestyle="-" if number <= 10 else "--",
+                label=plain(name.removeprefix("loss/"), 40),
             )  # fmt: skip
         panel.set_yscale("symlog", linthresh=1e-3)
-        panel.set_title(stage, fontsize=10)
+        panel.set_title(plain(stage, 40), fontsize=10)
         panel.set_xlabel("step", fontsize=9)
         panel.tick_params(labelsize=8)
         panel.grid(alpha=0.25)
@@ -158,15 +157,6 @@ def training_curve(metrics: Path, out: Path) -> None:
         )  # fmt: skip
     figure.tight_layout()
     save(figure, out)
-
-
-def save(figure: Figure, out: Path) -> None:
-    """Write a PNG under its final name only when complete."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_suffix(".tmp.png")
-    with mpl.rc_context({"svg.hashsalt": "scapo"}):
-        figure.savefig(temporary, format="png", metadata={"Software": None})
-    temporary.replace(out)
 
 
 SHARES = {

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """What a method believes the category to be: its template with parts and joints, opening.
 
-The template of a trained method: its points, parts and joints, and how its joints move it.
+First the template of a trained method and how its joints move it, then the picture of that.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -23,15 +24,17 @@ from bench.figures.drawing import (
     draw_points,
     look,
     part_legend,
+    plain,
+    save,
     transform,
     window,
 )
-from bench.figures.pictures import save
 from scapo.geometry import rigid as geometry
 from scapo.method import AbstractMethod
-from scapo.paper.method import Scapo
-from scapo.registered.method import RegisteredScapo
-from scapo.registered.template import Placement
+
+if TYPE_CHECKING:
+    from scapo.paper.method import Scapo
+    from scapo.registered.method import RegisteredScapo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +51,9 @@ class TemplateShape:
 
 def template_shape(method: AbstractMethod) -> TemplateShape | None:
     """The template at the states that the method calls 0; None for a method without one."""
+    from scapo.paper.method import Scapo
+    from scapo.registered.method import RegisteredScapo
+
     with torch.no_grad():
         if isinstance(method, RegisteredScapo):
             return _registered(method)
@@ -57,6 +63,8 @@ def template_shape(method: AbstractMethod) -> TemplateShape | None:
 
 
 def _registered(method: RegisteredScapo) -> TemplateShape:
+    from scapo.registered.template import Placement
+
     template = method.template
     origin, none = template.part_centres()[0], torch.zeros_like(template.points[:1])
     at_rest = Placement.at(torch.eye(3).to(none)[None], none, template.rest[None])
@@ -153,7 +161,8 @@ def template_picture(
         axes.set_title(f"{name}: {_state_text(value, turns)}", fontsize=9, pad=2)
     figure.subplots_adjust(left=0.005, right=0.995, bottom=0.05, top=0.9, wspace=0, hspace=0)
     words = f"{answered.header.method} {answered.header.variant}".strip()
-    figure.suptitle(f"{words}: the template of {answered.header.category}", fontsize=10, y=0.985)
+    title = f"{words}: the template of {answered.header.category}"
+    figure.suptitle(plain(title), fontsize=10, y=0.985)
     part_legend(figure, answered.split.manifest.parts, 0.025)
     save(figure, out)
 

@@ -1,124 +1,113 @@
 # SPDX-License-Identifier: MIT
-"""`scapo-bench predict RUN`: a trained method's answers to a split, as a predictions file."""
+"""`predict`: a trained method's answers to a split, as a predictions file."""
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Int
-from rich.console import Console
-from rich.progress import track
 
 from bench.methods import load
+from bench.requests import PredictRequest
+from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
 from bench.scoring.predictions import Header, write_predictions
-from scapo.method import AbstractMethod, Mode, OracleMethod, evenly
+from scapo.method import AbstractMethod, OracleMethod, evenly
+from scapo.records import map_tensors
 from scapo.store import open_split
+from scapo.store.checkpoint import require_fields
 from scapo.store.files import Arrays
-from scapo.store.samples import SampleDataset, label, map_labels, observe
-from scapo.training.run_folder import TIMING
-from scapo.types import Observation, Prediction
+from scapo.store.samples import SampleDataset, label, observe, observed
+from scapo.types import Prediction
 
 RUN_FIELDS = ("commit", "config", "data_digest", "machine", "seed", "training")
 """Of the checkpoint's header, handed on to scores and tables."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Predict:
-    """Predict parts, poses and joints of every cloud of a split."""
+Watch = Callable[[Sequence[torch.Tensor]], Iterable[torch.Tensor]]
+"""Passes batches on."""
 
-    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Run folder, or a checkpoint file."""
-    data: Path
-    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
-    out: Path
-    """Predictions file, NAME.safetensors."""
-    split: str = "test"
-    """Split to predict."""
-    mode: Mode = "fast"
-    """fast: networks only; refine: with optimisation at test time."""
-    oracle: bool = False
-    """Show a method that can use them true labels of the test split (icp: the parts); the
-    variant then begins with oracle."""
-    device: str = "auto"
-    """auto (CUDA where there is a GPU), cpu, cuda, ..."""
-    batch: int = 32
-    """Clouds at a time."""
-    limit: int | None = None
-    """Predict so many clouds alone, evenly spread over the split (500 are enough to calibrate);
-    the others have no answer in the file."""
 
-    def run(self, console: Console) -> None:
-        """Load, predict batch by batch, write the file."""
-        method, header = load(self.checkpoint)
-        device = pick_device(self.device)
-        method.to(device)
-        oracle = self._oracle_words(method)
-        split = open_split(self.data, header["category"], self.split)
-        samples = SampleDataset(split)
-        chosen = evenly(len(samples), self.limit or len(samples))
-        started = time.perf_counter()
-        parts = [
-            self._answer(method, samples, index, device)
-            for index in track(chosen.split(self.batch), description="predict", console=console)
-        ]
-        seconds = (time.perf_counter() - started) / len(chosen)
-        words = [method.variant, "" if self.mode == "fast" else self.mode, *oracle]
-        write_predictions(
-            self.out,
-            Header(
-                method=method.name,
-                variant="-".join(word for word in words if word),
-                category=header["category"],
-                split=self.split,
-                seed=header["seed"],
-                data_digest=split.manifest.digest,
-                supervision=tuple(sorted(method.supervision)),
-                budget={
-                    "device": device,
-                    "parameters": sum(item.numel() for item in method.parameters()),
-                    "steps": header["steps"],
-                    **timing(self.checkpoint),
-                    "seconds_per_cloud": round(seconds, 5),
-                },
-                run={name: header[name] for name in RUN_FIELDS if name in header},
-            ),
-            joined(parts, chosen.numpy(), len(samples)),
-        )
-        console.print(
-            f"{len(chosen)} clouds, {1000 * seconds:.1f} ms each: {self.out}", soft_wrap=True
-        )
+def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
+    """Load the method, predict batch by batch and write the file.
 
-    def _oracle_words(self, method: AbstractMethod) -> list[str]:
-        """What the variant says of labels at test time.
+    Args:
+        request: What is predicted, and how.
+        watch: Passes the batches on, and may show how far it is.
 
-        Raises:
-            ValueError: The method cannot use any.
-        """
-        if not self.oracle:
-            return []
-        if not isinstance(method, OracleMethod):
-            raise ValueError(f"--oracle: expected a method that takes one, found {method.name}")
-        return [f"oracle-{'-'.join(sorted(method.oracle))}"]
+    Returns:
+        How many clouds were answered, and the seconds of each.
 
-    def _answer(
-        self, method: AbstractMethod, samples: SampleDataset, index: torch.Tensor, device: str
-    ) -> Arrays:
-        """The tensors of a predictions file for the samples of `index`."""
-        batch = samples.batch(index)
-        observation = Observation(points=observe(batch).points.to(device))
-        if self.oracle and isinstance(method, OracleMethod):
-            labels = map_labels(label(batch).keep(method.oracle), lambda tensor: tensor.to(device))
-            return to_arrays(method.predict_given(observation, labels))
-        return to_arrays(method.predict(observation, self.mode))
+    Raises:
+        ValueError: `oracle` for a method that cannot use labels.
+        StoreError: No checkpoint, or no such data.
+    """
+    method, header = load(request.checkpoint)
+    require_fields(header, ("seed", "steps"), request.checkpoint)
+    device = pick_device(request.device)
+    method.to(device)
+    oracle = _oracle_words(method) if request.oracle else []
+    split = open_split(request.data, header["category"], request.split)
+    samples = SampleDataset(split, observed(split))
+    chosen = evenly(len(samples), request.limit or len(samples))
+    started = time.perf_counter()
+    batches = watch(chosen.split(request.batch))
+    parts = [_answer(request, method, samples, index, device) for index in batches]
+    seconds = (time.perf_counter() - started) / len(chosen)
+    words = [method.variant, "" if request.mode == "fast" else request.mode, *oracle]
+    write_predictions(
+        request.out,
+        Header(
+            method=method.name,
+            variant="-".join(word for word in words if word),
+            category=header["category"],
+            split=request.split,
+            seed=header["seed"],
+            data_digest=split.manifest.digest,
+            supervision=tuple(sorted(method.supervision)),
+            budget={
+                "device": device,
+                "parameters": sum(item.numel() for item in method.parameters()),
+                "steps": header["steps"],
+                **timing(request.checkpoint),
+                "seconds_per_cloud": round(seconds, 5),
+            },
+            run={name: header[name] for name in RUN_FIELDS if name in header},
+        ),
+        joined(parts, chosen.numpy(), len(samples)),
+    )
+    return len(chosen), seconds
+
+
+def _oracle_words(method: AbstractMethod) -> list[str]:
+    """What the variant says of labels at test time.
+
+    Raises:
+        ValueError: The method cannot use any.
+    """
+    if not isinstance(method, OracleMethod):
+        raise ValueError(f"--oracle: expected a method that takes one, found {method.name}")
+    return [f"oracle-{'-'.join(sorted(method.oracle))}"]
+
+
+def _answer(
+    request: PredictRequest,
+    method: AbstractMethod,
+    samples: SampleDataset,
+    index: torch.Tensor,
+    device: str,
+) -> Arrays:
+    """The tensors of a predictions file for the samples of `index`."""
+    batch = map_tensors(samples.batch(index), lambda tensor: tensor.to(device))
+    observation = observe(batch)
+    if request.oracle and isinstance(method, OracleMethod):
+        return to_arrays(method.predict_given(observation, label(batch).keep(method.oracle)))
+    return to_arrays(method.predict(observation, request.mode))
 
 
 def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -> Arrays:
@@ -135,14 +124,14 @@ def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -
 
 def timing(run: Path) -> dict[str, Any]:
     """Seconds of training, where the run folder is at hand."""
-    path = (run if run.is_dir() else run.parent) / TIMING
-    if not path.is_file():
+    folder = run if run.is_dir() else run.parent
+    if not (folder / TIMING).is_file():
         return {}
-    return {"training_seconds": round(json.loads(path.read_text())["seconds"], 1)}
+    return {"training_seconds": round(read_timing(folder).seconds, 1)}
 
 
 def to_arrays(prediction: Prediction) -> Arrays:
-    """CONTRACT 3's tensors; what the method does not say is left out."""
+    """The tensors of a predictions file; what the method does not say is left out."""
     joints = prediction.joints
     tensors = {
         "part_weight": prediction.part_weight,

@@ -15,10 +15,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from scapo.store.checkpoint import read_checkpoint
+from bench.run_files import METRICS, Timing, read_metrics, read_timing
+from scapo.store.checkpoint import RUN_FIELDS, read_checkpoint, require_fields
 from scapo.store.files import Header, write_bytes
 from scapo.training.log import PICTURES
-from scapo.training.run_folder import TIMING
 
 REPORT = "report.html"
 CURVES = "curves.png"
@@ -42,16 +42,17 @@ def write_report(run: Path) -> Path:
     """Write the page of a run with a checkpoint; returns its path.
 
     Raises:
-        StoreError: No checkpoint there.
+        StoreError: No checkpoint there, or a file of the run that is not what it should be.
     """
     _, header = read_checkpoint(run)
-    timing = json.loads((run / TIMING).read_text())
-    rows = read_metrics(run)
+    require_fields(header, RUN_FIELDS, run)
+    timing = read_timing(run)
+    rows = read_metrics(run / METRICS)
     sections = [
         ("What was run", facts(header)),
         ("Time", stages_table(timing, rows)),
         ("Loss", curves(run) + losses_table(rows)),
-        ("Pictures", pictures(run, list(timing["stage_seconds"]))),
+        ("Pictures", pictures(run, list(timing.stage_seconds))),
         ("How to go on", f"<pre>{escape(commands(header))}</pre>"),
         ("Configuration", _folded(header["config"])),
     ]
@@ -66,13 +67,6 @@ def write_report(run: Path) -> Path:
     )
     write_bytes(run / REPORT, page.encode())
     return run / REPORT
-
-
-def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """The lines of metrics.jsonl; none where there is no such file."""
-    path = run / "metrics.jsonl"
-    lines = path.read_text().splitlines() if path.is_file() else []
-    return [json.loads(line) for line in lines]
 
 
 def facts(header: Header) -> str:
@@ -100,24 +94,23 @@ def facts(header: Header) -> str:
 
 def arithmetic(training: Mapping[str, Any]) -> str:
     """Precision of the networks, and whether they were compiled."""
-    words = [training.get("precision", ""), "compiled" if training.get("compiled") else ""]
+    words = [str(training.get("precision", "")), "compiled" if training.get("compiled") else ""]
     return ", ".join(word for word in words if word)
 
 
-def stages_table(timing: Mapping[str, Any], rows: Iterable[Mapping[str, Any]]) -> str:
+def stages_table(timing: Timing, rows: Iterable[Mapping[str, Any]]) -> str:
     """Seconds and samples per second of each stage."""
     steps: dict[str, int] = {}
     for row in rows:
         steps[row["stage"]] = row["step"]
-    spent: Mapping[str, float] = timing["stage_seconds"]
     lines, before = [], 0
-    for name, seconds in spent.items():
-        rate = timing["samples_per_second"].get(name)
+    for name, seconds in timing.stage_seconds.items():
+        rate = timing.samples_per_second.get(name)
         last = steps.get(name, before)
         shown = "" if rate is None else f"{rate:.1f}"
         lines.append([name or "fit", last - before, f"{seconds:.1f}", shown])
         before = last
-    lines.append(["all", before, f"{timing['seconds']:.1f}", ""])
+    lines.append(["all", before, f"{timing.seconds:.1f}", ""])
     return table(["stage", "steps", "seconds, start included", "samples/s, last epoch"], lines)
 
 
@@ -140,10 +133,10 @@ def losses_table(rows: Iterable[Mapping[str, Any]]) -> str:
 
 def curves(run: Path) -> str:
     """The curves of the losses, drawn anew where matplotlib is installed."""
-    if find_spec("matplotlib") is not None and read_metrics(run):
+    if find_spec("matplotlib") is not None and read_metrics(run / METRICS):
         from bench.figures.pictures import training_curve
 
-        training_curve(run / "metrics.jsonl", run / CURVES)
+        training_curve(run / METRICS, run / CURVES)
     return image(run / CURVES, "terms of the loss against the step")
 
 

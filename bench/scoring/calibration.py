@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The frames of a method that saw no poses, fitted on its predictions of the training split.
 
-One rigid offset per part and one offset per joint state (PROTOCOL 1.6, 1.9), lengths in units of
+One rigid offset per part and one offset per joint state (docs/protocol.md), lengths in units of
 4 x the mean radius of each cloud. Truth is ordered and symmetry-corrected first, as in scoring.
 """
 

@@ -2,7 +2,7 @@
 """`--geometry opalign-compat`: the published OP-Align evaluator on the files of this project.
 
 The record is in the network's frame: x_net = (x - record_center) * record_expand, by default the
-cloud's centroid and 0.25 / mean radius (PROTOCOL 1.7).
+cloud's centroid and 0.25 / mean radius (docs/protocol.md).
 """
 
 from __future__ import annotations

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Scores on disk: gzipped CSV, one row per sample, metric, slot and unit, and JSON beside it."""
+"""Scores on disk: gzipped CSV, one row per sample, metric, slot and unit, and JSON beside it.
+
+Both appear together or not at all, and are read together: a report holds the digest of its scores.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,25 @@ import gzip
 import io
 import json
 import os
-from collections.abc import Iterator
+import secrets
+import warnings
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, BinaryIO, Literal, cast
 
 import numpy as np
 from jaxtyping import Int
 
 from bench.metrics import METRICS
 from bench.scoring.scores import Errors
-from scapo.store import StoreError, write_bytes
+from scapo.store import StoreError, sha256_bytes, sha256_file
+from scapo.store.json_records import from_json, read_json
+from scapo.store.regular import read_regular
+from scapo.text import as_cell, from_cell
+from scapo.types import Supervision
 
 FORMAT = "scapo-scores/1"
 SUFFIX = ".csv.gz"
@@ -27,7 +37,10 @@ COLUMNS = (
     "method", "variant", "seed", "data", "category", "split",
     "sample", "metric", "slot", "value", "unit",
 )  # fmt: skip
+LONGEST_NAME = 300
+"""Characters of a name; a variant is that of the predictions and the readings of the metrics."""
 _RANK = {metric.name: rank for rank, metric in enumerate(METRICS)}
+_UNITS = {(metric.name, unit) for metric in METRICS for unit in metric.units}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,9 +58,93 @@ class Run:
     def row(self) -> str:
         """Those columns as CSV text."""
         buffer = io.StringIO()
-        fields = (self.method, self.variant, self.seed, self.data, self.category, self.split)
+        fields = [as_cell(v) if isinstance(v, str) else v for v in asdict(self).values()]
         csv.writer(buffer, lineterminator="").writerow(fields)
         return buffer.getvalue()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """Mean of a metric with its 95 % interval; None where no value is defined."""
+
+    mean: float | None
+    low: float | None
+    high: float | None
+    count: int
+    undefined: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Counts:
+    """Of what was scored."""
+
+    samples: int
+    instances: int
+    unanswered: dict[str, int]
+    """Samples without an answer, by tensor."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seeds:
+    """Of what was drawn at random."""
+
+    training: int
+    calibration: int | None
+    bootstrap: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Digests:
+    """SHA-256 of what was read and written."""
+
+    data: str
+    predictions: str
+    scores: str | None = None
+    """None in reports of before it was kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bootstrap:
+    """How the intervals were made."""
+
+    resamples: int
+    seed: int
+    unit: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """The JSON beside the scores."""
+
+    format: Literal["scapo-scores/1"]
+    method: str
+    variant: str
+    seed: int
+    data: str
+    category: str
+    split: str
+    supervision: tuple[Supervision, ...]
+    budget: dict[str, Any]
+    """As the predictions' header has it."""
+    parts: tuple[str, ...]
+    joints: tuple[str, ...]
+    settings: dict[str, str]
+    counts: Counts
+    calibration: dict[str, Any] | None
+    seeds: Seeds
+    part_order: tuple[int, ...] | None
+    digests: Digests
+    run: dict[str, Any]
+    """The training, as the predictions' header has it."""
+    commit: str
+    machine: dict[str, str | int]
+    versions: dict[str, str]
+    instance: tuple[int, ...]
+    """The object of each sample."""
+    summary: dict[str, Summary]
+    """By metric and unit, such as `iou_1`."""
+    average_precision: dict[str, Any]
+    bootstrap: Bootstrap
 
 
 def side_file(scores: Path) -> Path:
@@ -57,48 +154,84 @@ def side_file(scores: Path) -> Path:
     return scores.with_name(scores.name.removesuffix(SUFFIX) + ".json")
 
 
+class ScoresWriter:
+    """Rows and report of a scores file that is not there yet."""
+
+    def __init__(self, stream: gzip.GzipFile) -> None:
+        """Rows go to `stream`."""
+        self.stream = stream
+        self.report: dict[str, Any] = {}
+        """To be set before the end."""
+
+    def add(self, run: Run, first: int, errors: Errors) -> None:
+        """The rows of samples first, first+1, ...; undefined values are empty."""
+        names = sorted(errors, key=lambda key: _RANK[key[0]])
+        slots = [(name, slot, unit) for name, unit in names
+                 for slot in range(errors[name, unit].shape[1])]  # fmt: skip
+        table = np.concatenate([errors[key] for key in names], 1)
+        before = [f",{name},{slot}," for name, slot, _ in slots]
+        after = [f",{unit}\n" for _, _, unit in slots]
+        head = run.row
+        lines: list[str] = []
+        for index, values in enumerate(table.tolist(), first):
+            start = f"{head},{index}"
+            lines.extend(
+                f"{start}{b}{'' if v != v else format(v, '.9g')}{a}"
+                for b, v, a in zip(before, values, after, strict=True)
+            )
+        self.stream.write("".join(lines).encode())
+
+
 @contextmanager
-def writing(path: Path) -> Iterator[gzip.GzipFile]:
-    """A gzip stream without time or name in it, renamed to `path` when complete."""
+def writing(path: Path) -> Iterator[ScoresWriter]:
+    """A writer whose scores and report get their names together, when both are complete.
+
+    The gzip stream has no time and no name in it: the same scores are the same bytes.
+
+    Raises:
+        StoreError: A folder is in the way.
+        OSError: It cannot be written; the file it names is `path` or the report.
+    """
+    beside = side_file(path)
+    for target in (path, beside):
+        if target.is_dir():
+            raise StoreError(f"{target}: expected a file to write, found a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    mark = secrets.token_hex(8)
+    scores, report = (path.with_name(f".{mark}.{kind}.tmp") for kind in ("csv", "json"))
     try:
-        with temporary.open("wb") as raw:
-            with gzip.GzipFile("", "wb", 6, raw, mtime=0) as stream:
-                stream.write((",".join(COLUMNS) + "\n").encode())
-                yield stream
+        with (
+            _creating(scores, path) as raw,
+            gzip.GzipFile("", "wb", 6, raw, mtime=0) as stream,
+        ):
+            stream.write((",".join(COLUMNS) + "\n").encode())
+            writer = ScoresWriter(stream)
+            yield writer
+        record = {"format": FORMAT, **writer.report}
+        record["digests"] = {**record["digests"], "scores": sha256_file(scores)}
+        text = json.dumps(record, sort_keys=True, indent=1, allow_nan=False)
+        with _creating(report, beside) as raw:
+            raw.write((text + "\n").encode())
+        report.replace(beside)
+        scores.replace(path)
+    finally:
+        for temporary in (scores, report):
+            with suppress(OSError):
+                temporary.unlink()
+
+
+@contextmanager
+def _creating(temporary: Path, path: Path) -> Iterator[BinaryIO]:
+    """A new file, flushed to disk; its errors name the `path` that it is to have."""
+    try:
+        with temporary.open("xb") as raw:
+            yield raw
             raw.flush()
             os.fsync(raw.fileno())
-        temporary.replace(path)
-    finally:
-        with suppress(FileNotFoundError):
-            temporary.unlink()
-
-
-def write_rows(stream: gzip.GzipFile, run: Run, first: int, errors: Errors) -> None:
-    """The rows of samples first, first+1, ...; undefined values are empty."""
-    names = sorted(errors, key=lambda key: _RANK[key[0]])
-    columns = [
-        (name, slot, unit) for name, unit in names for slot in range(errors[name, unit].shape[1])
-    ]
-    table = np.concatenate([errors[key] for key in names], 1)
-    before = [f",{name},{slot}," for name, slot, _ in columns]
-    after = [f",{unit}\n" for _, _, unit in columns]
-    head = run.row
-    lines: list[str] = []
-    for index, values in enumerate(table.tolist(), first):
-        start = f"{head},{index}"
-        lines.extend(
-            f"{start}{b}{'' if v != v else format(v, '.9g')}{a}"
-            for b, v, a in zip(before, values, after, strict=True)
-        )
-    stream.write("".join(lines).encode())
-
-
-def write_report(path: Path, report: dict[str, Any]) -> None:
-    """The JSON beside the scores: sorted, NaN refused."""
-    text = json.dumps({"format": FORMAT, **report}, sort_keys=True, indent=1, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
+    except OSError as error:
+        if error.filename not in (None, str(temporary)):  # of another file, read meanwhile
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,67 +242,87 @@ class Scores:
     run: Run
     samples: Int[np.ndarray, " B"]
     errors: Errors
-    report: dict[str, Any]
-    """The JSON beside it; empty where there is none."""
+    report: Report
 
     @property
     def instance(self) -> Int[np.ndarray, " B"]:
-        """The object of each sample; without the JSON every sample counts as its own."""
-        known = self.report.get("instance")
-        if known is None or len(known) <= int(self.samples.max(initial=-1)):
-            return self.samples
-        return np.asarray(known, np.int64)[self.samples]
+        """The object of each sample."""
+        return np.asarray(self.report.instance, np.int64)[self.samples]
+
+
+def is_report(path: Path) -> bool:
+    """Whether a JSON file says that it is a report of scores."""
+    try:
+        data = read_json(path)
+    except StoreError:
+        return False
+    return isinstance(data, dict) and data.get("format") == FORMAT
+
+
+def read_report(scores: Path) -> Report:
+    """The report beside a scores file.
+
+    Raises:
+        StoreError: None there, or a field is missing or not what it should be.
+    """
+    path = side_file(scores)
+    if not path.is_file():
+        raise StoreError(f"{path}: expected the report of {scores.name} beside it, found none")
+    return from_json(Report, read_json(path), str(path))
 
 
 def read_scores(path: Path) -> list[Scores]:
     """The runs of a scores file, usually one.
 
     Raises:
-        StoreError: Not gzip, not our columns, a value that is no number, slots with gaps.
+        StoreError: Not gzip, not our columns, a value that is no number, slots with gaps, no
+            report or that of other scores.
     """
-    frame = _read_frame(path)
-    report = _read_report(side_file(path))
+    report = read_report(path)
+    try:
+        data = read_regular(path)
+    except OSError as error:
+        raise StoreError(f"{path}: expected gzipped CSV of scores, found {error}") from error
+    frame = _read_frame(path, data)
+    if report.digests.scores not in (None, sha256_bytes(data)):
+        raise StoreError(f"{path}: expected the scores of {side_file(path).name}, found others")
     out = []
     for key, rows in frame.groupby(list(COLUMNS[:6]), sort=True):
         method, variant, seed, data, category, split = cast("tuple[Any, ...]", key)
-        run = Run(
-            method=method,
-            variant=variant,
-            seed=int(seed),
-            data=data,
-            category=category,
-            split=split,
-        )
+        run = Run(method=method, variant=variant, seed=int(seed), data=data,
+                  category=category, split=split)  # fmt: skip
         samples = np.unique(rows["sample"].to_numpy())
-        out.append(
-            Scores(
-                path=path,
-                run=run,
-                samples=samples,
-                report=report,
-                errors=_arrays(path, rows, samples),
+        if samples[0] < 0 or samples[-1] >= len(report.instance):
+            raise StoreError(
+                f"{path}: expected samples 0 to {len(report.instance) - 1} as in the report, "
+                f"found {samples[0]} to {samples[-1]}"
             )
-        )
+        out.append(Scores(path=path, run=run, samples=samples, report=report,
+                          errors=_arrays(path, rows, samples)))  # fmt: skip
     return out
 
 
-def _read_frame(path: Path) -> Any:  # noqa: ANN401
+def _read_frame(path: Path, data: bytes) -> Any:  # noqa: ANN401
+    """All rows, their names as they were before `as_cell`."""
     import pandas as pd
 
+    names = [*COLUMNS[:2], *COLUMNS[3:6]]
     types = {
-        **dict.fromkeys(("method", "variant", "data", "category", "split", "metric", "unit"), str),
+        **dict.fromkeys((*names, "metric", "unit"), str),
         **dict.fromkeys(("seed", "sample", "slot"), np.int64),
         "value": float,
     }
     try:
-        frame = pd.read_csv(
-            path,
-            compression="gzip",
-            keep_default_na=False,
-            na_values={"value": [""]},
-            dtype=cast("Any", types),
-        )
-    except (OSError, EOFError, ValueError, pd.errors.ParserError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of numbers that no integer can be
+            frame = pd.read_csv(
+                io.BytesIO(data),
+                compression="gzip",
+                keep_default_na=False,
+                na_values={"value": [""]},
+                dtype=cast("Any", types),
+            )
+    except (OSError, EOFError, ValueError, OverflowError, zlib.error, Warning) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise StoreError(f"{path}: expected gzipped CSV of scores, found {first}") from error
     if tuple(frame.columns) != COLUMNS:
@@ -177,6 +330,24 @@ def _read_frame(path: Path) -> Any:  # noqa: ANN401
             f"{path}: expected columns {','.join(COLUMNS)}, found "
             f"{','.join(map(str, frame.columns))}"
         )
+    if frame.drop(columns="value").isna().any(axis=None):
+        raise StoreError(f"{path}: expected {len(COLUMNS)} cells in every row, found fewer")
+    return _checked(path, frame, names)
+
+
+def _checked(path: Path, frame: Any, names: Sequence[str]) -> Any:  # noqa: ANN401
+    """The rows with the names of these columns as they were written, values possible."""
+    for name in names:
+        for text in frame[name].unique():
+            if not text.isprintable() or len(text) > LONGEST_NAME:
+                raise StoreError(
+                    f"{path}: {name}: expected at most {LONGEST_NAME} printable characters, "
+                    f"found {text[:LONGEST_NAME]!r}"
+                )
+        frame[name] = frame[name].map(from_cell)
+    values = frame["value"].dropna()
+    if not ((values >= 0) & (values < np.inf)).all():
+        raise StoreError(f"{path}: value: expected finite numbers of 0 or more, found another")
     return frame
 
 
@@ -185,26 +356,18 @@ def _arrays(path: Path, rows: Any, samples: Int[np.ndarray, " B"]) -> Errors:  #
     for (name, unit), group in rows.groupby(["metric", "unit"], sort=False):
         if name not in _RANK:
             raise StoreError(f"{path}: expected metrics {', '.join(_RANK)}, found {name!r}")
+        if (name, unit) not in _UNITS:
+            raise StoreError(f"{path}: metric {name!r}: expected one of its units, found {unit!r}")
         slots = group["slot"].to_numpy()
-        table = np.full((len(samples), int(slots.max()) + 1), np.nan)
+        count = int(slots.max()) + 1
         index = np.searchsorted(samples, group["sample"].to_numpy())
-        if len(group) != table.size or len(np.unique(index * table.shape[1] + slots)) != len(group):
+        size = len(samples) * count
+        if slots.min() < 0 or len(group) != size or len(np.unique(index * count + slots)) != size:
             raise StoreError(
                 f"{path}: metric {name!r}: expected one row for each of "
-                f"{table.size} samples and slots, found {len(group)} rows"
+                f"{size} samples and slots, found {len(group)} rows"
             )
+        table = np.full((len(samples), count), np.nan)
         table[index, slots] = group["value"].to_numpy()
         errors[name, unit] = table
     return errors
-
-
-def _read_report(path: Path) -> dict[str, Any]:
-    try:
-        report = json.loads(path.read_text())
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: expected the JSON of a scores file, found {error}") from error
-    if not isinstance(report, dict) or report.get("format") != FORMAT:
-        raise StoreError(f"{path}: expected format {FORMAT!r}, found another")
-    return report

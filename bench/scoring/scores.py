@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from bench.matching import (
-    LabelOrder,
     apply_calibration,
     hard_labels,
     is_swapped,
@@ -20,49 +18,20 @@ from bench.matching import (
 )
 from bench.metrics import (
     Agreement,
-    ApRule,
-    IouKind,
-    PivotKind,
-    RotationKind,
     agree,
     joint_errors,
     pose_errors,
     state_errors,
     state_sign,
 )
+from bench.requests import Settings
 from bench.scoring.truth import Truth
 
-Geometry = Literal["se3", "opalign-compat"]
 Rows = dict[str, np.ndarray]
 """Tensors of a predictions file for some samples."""
 Errors = dict[tuple[str, str], np.ndarray]
 """(metric, unit) -> (B, slots); a prismatic state has its lengths, a revolute one its degrees,
 and NaN in the other."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """The readings of PROTOCOL 6; the defaults are the benchmark's."""
-
-    geometry: Geometry = "se3"
-    """Rigid geometry, or OP-Align's released evaluator on `record_*` tensors."""
-    ap_rule: ApRule = "mean"
-    """How the parts of a sample join in the average precision."""
-    pivot: PivotKind = "point-line"
-    """Predicted pivot to true axis, or between the two axes."""
-    label_order: LabelOrder = "sample"
-    """Part order chosen per sample, once per data set, or by Hungarian matching per sample."""
-    iou: IouKind = "hard"
-    """On labels, or on weights."""
-    rotation: RotationKind = "full"
-    """Rotation errors up to 180 degrees, or folded to 90."""
-
-    def changes(self) -> str:
-        """What differs from the defaults and changes per-sample scores, for the variant's name."""
-        names = ("geometry", "pivot", "label_order", "iou", "rotation")
-        default = Settings()
-        changed = [n for n in names if getattr(self, n) != getattr(default, n)]
-        return ",".join(f"{n.replace('_', '-')}={getattr(self, n)}" for n in changed)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

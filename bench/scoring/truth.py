@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError, safe_open
 
 from scapo.categories import CATEGORIES
@@ -31,6 +31,21 @@ _DTYPES = {
 }
 
 
+_ALIKE = {"alike": "U8", "alike_base": "F32", "alike_state": "F32", "alike_part": "U8"}
+"""Tensors that not every split has."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alike:
+    """The turns of the true object that look as it does (docs/ambiguity.md)."""
+
+    turns: Bool[np.ndarray, "B 24"]
+    camera_T_base: Float[np.ndarray, "B 24 4 4"]
+    state: Float[np.ndarray, "B 24 J"]
+    part: Int[np.ndarray, "B 24 P"]
+    """The true part in whose place part p of the turned object is."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
     """Consecutive samples of one split. Camera frame, metres, radians."""
@@ -47,6 +62,8 @@ class Truth:
     instance: Int[np.ndarray, " B"]
     scale: Float[np.ndarray, " B"]
     """Metres of one unit `r4`: 4 x the mean distance of the cloud's points from their centroid."""
+    alike: Alike | None = None
+    """None where the data do not say."""
 
     def __len__(self) -> int:
         return len(self.instance)
@@ -76,7 +93,8 @@ def blocks(split: Split, size: int = BLOCK) -> Iterator[Truth]:
         _check_shard(path, split, shard.count)
         try:
             with safe_open(path, "numpy") as file:
-                slices = {name: file.get_slice(name) for name in _DTYPES}
+                there = [*_DTYPES, *(name for name in _ALIKE if name in file.keys())]  # noqa: SIM118
+                slices = {name: file.get_slice(name) for name in there}
                 for start in range(0, shard.count, size):
                     stop = min(start + size, shard.count)
                     rows = {name: item[start:stop] for name, item in slices.items()}
@@ -89,7 +107,8 @@ def _check_shard(path: Path, split: Split, count: int) -> None:
     read_header(path, SAMPLES)
     with safe_open(path, "numpy") as file:
         names = set(file.keys())
-        for name, dtype in _DTYPES.items():
+        wanted = _DTYPES | (_ALIKE if names & _ALIKE.keys() else {})
+        for name, dtype in wanted.items():
             if name not in names:
                 raise StoreError(f"{path}: expected tensor {name!r}, found none")
             item = file.get_slice(name)
@@ -127,5 +146,15 @@ def _truth(path: Path, first: int, rows: dict[str, np.ndarray]) -> Truth:
         part=part,
         instance=rows["instance"].astype(np.int64),
         scale=4 * radius,
+        alike=_alike(rows) if "alike" in rows else None,
         **wide,
+    )
+
+
+def _alike(rows: dict[str, np.ndarray]) -> Alike:
+    return Alike(
+        turns=rows["alike"] == 1,
+        camera_T_base=rows["alike_base"].astype(np.float64),
+        state=rows["alike_state"].astype(np.float64),
+        part=rows["alike_part"].astype(np.int64),
     )

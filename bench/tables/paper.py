@@ -152,7 +152,7 @@ def ablation_agrees(cells: Cells) -> list[str]:
 
 
 def check() -> list[str]:
-    """Everything that does not add up in the printed tables, one line each (PROTOCOL 4.6)."""
+    """Everything that does not add up in the printed tables, one line each (docs/protocol.md)."""
     cells = printed_cells()
     return [
         *(mismatch.line for mismatch in mean_mismatches(cells)),

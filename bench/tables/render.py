@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Tables as Markdown for people and as CSV, one row per cell, for programs.
+"""A table as Markdown for people, as CSV for programs and as a LaTeX document of one page.
 
-Tables as LaTeX documents of one page (booktabs).
+Names of methods, variants and notes may come from anybody's files: in each form they are text,
+never markup, formulas or commands.
 """
 
 from __future__ import annotations
@@ -10,9 +11,8 @@ import csv
 import io
 import re
 
-from bench.tables.model import DASH, Block, Cell, Marks, Row, Table
-
-_CHECK = "✓"
+from bench.tables.model import DASH, Cell, Marks, Row, Table
+from scapo.text import as_cell, as_markdown
 
 
 def to_markdown(table: Table) -> str:
@@ -21,30 +21,28 @@ def to_markdown(table: Table) -> str:
     lines = [
         f"**Table {table.number}.** {table.title}.",
         "",
-        _line(heads),
+        _line([as_markdown(head) for head in heads]),
         _line(["---"] * 6 + ["---:"] * len(table.columns)),
     ]
     for block in table.blocks:
-        for number, row in enumerate(block.rows):
-            first = f"**{block.heading}**" if number == 0 else ""
-            lines.append(
-                _line([first, row.method, row.source, *_checks(row.marks), *map(_cell, row.cells)])
-            )
-    return "\n".join([*lines, "", *(f"- {note}" for note in table.notes), ""])
+        first = f"**{as_markdown(block.heading)}**"
+        for row in block.rows:
+            names = [first, as_markdown(row.method), row.source]
+            lines.append(_line([*names, *_checks(row.marks, "✓"), *map(_markdown, row.cells)]))
+            first = ""
+    return "\n".join([*lines, "", *(f"- {as_markdown(note)}" for note in table.notes), ""])
 
 
-def _line(fields: list[str] | tuple[str, ...]) -> str:
-    return "| " + " | ".join(field.replace("|", "\\|") for field in fields) + " |"
+def _line(fields: list[str]) -> str:
+    return "| " + " | ".join(fields) + " |"
 
 
-def _checks(marks: Marks | None) -> list[str]:
-    return ["", "", ""] if marks is None else [_CHECK if mark else "" for mark in marks]
+def _checks(marks: Marks | None, check: str) -> list[str]:
+    return [check if mark else "" for mark in marks or (False, False, False)]
 
 
-def _cell(cell: Cell) -> str:
-    text = cell.shown
-    if cell.best:
-        text = f"**{text}**"
+def _markdown(cell: Cell) -> str:
+    text = f"**{cell.shown}**" if cell.best else cell.shown
     if cell.flag:
         text += "†"
     if cell.deviation is not None:
@@ -65,13 +63,13 @@ def to_csv(table: Table) -> str:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
-    names = _column_names(table)
+    columns = [as_cell(name) for name in _column_names(table)]
     for block in table.blocks:
         for row in block.rows:
-            marks = ("", "", "") if row.marks is None else map(int, row.marks)
-            start = (table.number, block.heading, row.method, row.source, *marks)
-            for name, cell in zip(names, row.cells, strict=True):
-                writer.writerow((*start, name, *_values(cell, row.seeds)))
+            marks = ("", "", "") if row.marks is None else tuple(map(int, row.marks))
+            names = (as_cell(block.heading), as_cell(row.method), row.source)
+            for column, cell in zip(columns, row.cells, strict=True):
+                writer.writerow((table.number, *names, *marks, column, *_values(cell, row.seeds)))
     return buffer.getvalue()
 
 
@@ -84,9 +82,8 @@ def _column_names(table: Table) -> list[str]:
 
 
 def _values(cell: Cell, seeds: int) -> tuple[object, ...]:
-    value = cell.text if cell.text is not None else _number(cell.value)
     return (
-        value,
+        cell.text if cell.text is not None else _number(cell.value),
         _number(cell.low),
         _number(cell.high),
         _number(cell.deviation),
@@ -124,7 +121,7 @@ PREAMBLE = r"""\documentclass{{article}}
 def escape(text: str) -> str:
     """Text without LaTeX's special characters; what the fonts lack becomes `?`."""
     out = "".join(_ESCAPES.get(char, char) for char in text)
-    return re.sub(r"[^\x00-\x7f]", "?", out)
+    return re.sub(r"[^\x20-\x7e]", "?", out)
 
 
 def to_latex(table: Table) -> str:
@@ -134,16 +131,19 @@ def to_latex(table: Table) -> str:
     width = 80 + len(table.columns) * (26 if wide else 13)
     height = 45 + 3 * (len(rows) + len(table.blocks)) + 3 * len(table.blocks)
     height += sum(3 + 3 * len(note) // width for note in table.notes)
+    names = ("Method", "", "Pose", "Seg.", "Joint", *table.columns)
     lines = [
         PREAMBLE.format(width=width, height=height),
         rf"\textbf{{Table {table.number}.}} {escape(table.title)}.\par\medskip",
         rf"\begin{{tabular}}{{@{{}}ll{'c' * 3}{'r' * len(table.columns)}@{{}}}}",
         r"\toprule",
         *_over(table),
-        _heads(table) + r" \\",
+        " & ".join(map(escape, names)) + r" \\",
     ]
     for block in table.blocks:
-        lines += [r"\midrule", *_block(block, 5 + len(table.columns))]
+        heading = rf"{{\textbf{{{escape(block.heading)}}}}} \\"
+        lines += [r"\midrule", rf"\multicolumn{{{len(names)}}}{{@{{}}l@{{}}}}{heading}"]
+        lines += map(_latex_row, block.rows)
     lines += [r"\bottomrule", r"\end{tabular}\par\medskip"]
     lines += [rf"{escape(note)}\par" for note in table.notes]
     return "\n".join([*lines, r"\end{document}", ""])
@@ -162,31 +162,12 @@ def _over(table: Table) -> list[str]:
     return [" & ".join(cells) + r" \\", " ".join(rules)]
 
 
-def _heads(table: Table) -> str:
-    names = ("Method", "", "Pose", "Seg.", "Joint", *table.columns)
-    return " & ".join(escape(name) for name in names)
+def _latex_row(row: Row) -> str:
+    checks = _checks(row.marks, r"$\checkmark$")
+    return " & ".join([escape(row.method), row.source, *checks, *map(_latex, row.cells)]) + r" \\"
 
 
-def _block(block: Block, width: int) -> list[str]:
-    heading = rf"\multicolumn{{{width}}}{{@{{}}l@{{}}}}{{\textbf{{{escape(block.heading)}}}}} \\"
-    return [heading, *(_row(row) for row in block.rows)]
-
-
-def _row(row: Row) -> str:
-    fields = [
-        escape(row.method),
-        row.source,
-        *_latex_checks(row.marks),
-        *map(_latex_cell, row.cells),
-    ]
-    return " & ".join(fields) + r" \\"
-
-
-def _latex_checks(marks: Marks | None) -> list[str]:
-    return ["", "", ""] if marks is None else [r"$\checkmark$" if mark else "" for mark in marks]
-
-
-def _latex_cell(cell: Cell) -> str:
+def _latex(cell: Cell) -> str:
     text = "--" if cell.shown == DASH else escape(cell.shown)
     if cell.best:
         text = rf"\textbf{{{text}}}"

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bench.metrics import ApRule
-from bench.scoring.score_files import SUFFIX, Scores, read_scores
+from bench.scoring.score_files import SUFFIX, Scores, is_report, read_scores, side_file
 from bench.scoring.summary import passes
 from bench.statistics import bounds, resampled_means, spread
 from bench.tables.model import Cell
@@ -90,11 +90,16 @@ def load(folder: Path) -> Results:
     """Every `*.csv.gz` below a folder.
 
     Raises:
-        StoreError: No such folder, or a file that is no scores file.
+        StoreError: No such folder, a file that is no scores file, or scores or a report alone.
     """
     if not folder.is_dir():
         raise StoreError(f"{folder}: expected a folder of scores, found none")
     files = sorted(folder.rglob(f"*{SUFFIX}"))
+    alone = {path for path in folder.rglob("*.json") if is_report(path)} - set(
+        map(side_file, files)
+    )
+    for path in sorted(alone):
+        raise StoreError(f"{path}: expected the scores of this report beside it, found none")
     return Results([scores for file in files for scores in read_scores(file)])
 
 

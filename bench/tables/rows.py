@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Rows of the tables: the paper's as printed, ours from the scores, and their order.
+"""Rows of the tables, the paper's as printed and ours from the scores, and their order.
 
-What is printed under every table: how to read it, and what each row cost.
+Below them the notes of every table: how to read it, and what each row cost.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from bench.methods import all_methods
 from bench.tables.model import Cell, Marks, Row
 from bench.tables.paper import MEAN, Cells, Mismatch
 from bench.tables.results import Kind, Results, Sampled, Series, averaged, kind_of
-from bench.tables.spec import METHODS, ORDER, PAPER_METHODS, REFERENCE, TABLE_1
+from bench.tables.spec import PAPER_METHODS, PUBLISHED, REFERENCE, TABLE_1
+from scapo.text import one_line
 
 DATASET_ORDER = "label-order=dataset"
 
@@ -77,9 +79,19 @@ def our_row(
     )
 
 
+def titles() -> dict[str, tuple[str, int]]:
+    """Names of methods in scores -> what a table calls them, and their rank."""
+    return PUBLISHED | {name: (one.title, one.rank) for name, one in all_methods().items()}
+
+
+def title(method: str) -> str:
+    """What a table calls a method."""
+    return REFERENCE.get(method) or titles().get(method, (method, 0))[0]
+
+
 def display_name(series: Series) -> str:
     """What a table calls a series."""
-    name = METHODS.get(series.method, series.method)
+    name = title(series.method)
     if series.variant not in ("", "default"):
         name += f" ({series.variant})"
     if series.switches == DATASET_ORDER:
@@ -94,19 +106,20 @@ def marks_of(results: Results, series: Series) -> Marks | None:
     for run in results.all_runs():
         same = (run.run.method, run.run.variant.partition("[")[0]) == (
             series.method, series.variant)  # fmt: skip
-        if same and "supervision" in run.report and series.method not in REFERENCE:
-            labels = run.report["supervision"]
+        if same and series.method not in REFERENCE:
+            labels = run.report.supervision
             return ("pose" in labels, "segmentation" in labels, "joint" in labels)
     return None
 
 
 def in_order(rows: Sequence[Row]) -> list[Row]:
-    """In the paper's order of methods, each printed row before ours of that method."""
+    """By the rank of methods, each printed row before ours of that method; references last."""
+    order = [name for name, _ in sorted(titles().values(), key=lambda one: one[1])]
 
     def rank(row: Row) -> tuple[int, int]:
-        known = [i for i, name in enumerate(ORDER) if row.method.startswith(name)]
-        reference = any(row.method.startswith(METHODS[name]) for name in REFERENCE)
-        return (known[-1] if known else len(ORDER) + reference, row.source != "paper")
+        known = [i for i, name in enumerate(order) if row.method.startswith(name)]
+        reference = row.method.startswith(tuple(REFERENCE.values()))
+        return (known[-1] if known else len(order) + reference, row.source != "paper")
 
     return sorted(rows, key=rank)
 
@@ -136,18 +149,14 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
             or "[" in run.run.variant
         ):
             continue
-        budget = run.report.get("budget") or {}
-        cost = (
-            ", ".join(
-                f"{key.replace('_', ' ')} {_short(value)}" for key, value in sorted(budget.items())
-            )
-            or "not stated"
-        )
-        name = METHODS.get(run.run.method, run.run.method)
+        budget = run.report.budget
+        named = {_short(key.replace("_", " ")): value for key, value in sorted(budget.items())}
+        cost = ", ".join(f"{key} {_short(value)}" for key, value in named.items())
+        name = title(run.run.method)
         variant = f" ({run.run.variant})" if run.run.variant else ""
         text = (
             f"{name}{variant}, {run.run.category} on {run.run.data}, "
-            f"{len(run.samples)} samples; budget: {cost}"
+            f"{len(run.samples)} samples; budget: {cost or 'not stated'}"
         )
         lines.setdefault(text, set()).add(run.run.seed)
     return tuple(
@@ -156,4 +165,4 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
 
 
 def _short(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return f"{value:.4g}" if isinstance(value, float) else one_line(value, 200)

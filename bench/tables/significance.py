@@ -17,6 +17,7 @@ from bench.scoring.summary import passes
 from bench.statistics import Paired, paired
 from bench.tables.results import Place, Results, series_of
 from bench.tables.spec import TABLE_1
+from scapo.text import as_cell
 
 COLUMNS = (
     "data", "category", "metric", "unit", "first", "second", "difference", "low", "high",
@@ -31,26 +32,14 @@ def significance_csv(results: Results, rule: ApRule = "mean") -> str:
     writer.writerow(COLUMNS)
     for runs_a, runs_b in _pairs(results):
         first, second = runs_a[0], runs_b[0]
-        names = [
-            f"{s.method}/{s.variant}" if s.variant else s.method
-            for s in (series_of(first), series_of(second))
-        ]
+        both = (series_of(first), series_of(second))
+        names = [as_cell(f"{s.method}/{s.variant}" if s.variant else s.method) for s in both]
+        place = (as_cell(first.run.data), as_cell(first.run.category))
         for metric, unit, result in _compared(runs_a, runs_b, rule):
             if result.samples:
-                writer.writerow(
-                    (
-                        first.run.data,
-                        first.run.category,
-                        metric,
-                        unit,
-                        *names,
-                        repr(result.difference),
-                        repr(result.low),
-                        repr(result.high),
-                        repr(result.p_value),
-                        result.samples,
-                    )
-                )
+                numbers = (result.difference, result.low, result.high, result.p_value)
+                row = (*place, metric, unit, *names, *map(repr, numbers), result.samples)
+                writer.writerow(row)
     return buffer.getvalue()
 
 

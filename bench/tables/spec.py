@@ -66,27 +66,20 @@ ABLATION_NAMES = {
     "wo_joint_boundary": "w/o L_joint-boundary",
 }
 
-METHODS = {
-    "3dgcn": "3DGCN",
-    "gcn3d": "3DGCN",
-    "pointnet2": "PointNet++",
-    "npcs-epn": "NPCS-EPN",
-    "icp": "ICP",
-    "eap": "EAP",
-    "op-align": "OP-Align",
-    "scapo": "SCAPO",
-    "registered": "SCAPO, registered",
-    "constant": "Constant prediction",
-    "oracle-pose": "Oracle pose",
+PUBLISHED = {
+    "3dgcn": ("3DGCN", 10),
+    "gcn3d": ("3DGCN", 10),
+    "pointnet2": ("PointNet++", 20),
+    "npcs-epn": ("NPCS-EPN", 30),
+    "eap": ("EAP", 50),
+    "op-align": ("OP-Align", 60),
 }
-"""A predictions file's method -> what a table calls it."""
-
-ORDER = ("3DGCN", "PointNet++", "NPCS-EPN", "ICP", "EAP", "OP-Align", "SCAPO", "SCAPO, registered")
-"""Of the rows of a block."""
+"""Methods that are not trained here: name in a predictions file -> what a table calls it, and its
+rank among the methods of `bench.methods`, which say the same of themselves."""
 
 PAPER_METHODS = {"Ours": "SCAPO", "OP-Align(SJ)": "OP-Align"}
 """Names of `paper.csv` that differ from ours."""
 
-REFERENCE = ("constant", "oracle-pose")
+REFERENCE = {"constant": "Constant prediction", "oracle-pose": "Oracle pose"}
 """Rows that are no method: what a constant answer scores, and what true poses would. Not ranked,
 and printed with every table, run or not."""

@@ -15,7 +15,7 @@ from bench.tables.model import Block, Cell, Row, Table, mark_best
 from bench.tables.paper import MEAN, Cells, Mismatch, mean_mismatches, printed_cells
 from bench.tables.precision import table_2
 from bench.tables.render import to_csv, to_latex, to_markdown
-from bench.tables.results import Place, Results, Series, averaged, measured
+from bench.tables.results import Place, Results, Series, averaged, load, measured
 from bench.tables.rows import (
     budget_notes,
     general_notes,
@@ -49,8 +49,16 @@ def build(results: Results, rule: ApRule = "mean") -> tuple[Table, Table, Table,
     )
 
 
-def write(results: Results, out: Path, rule: ApRule = "mean") -> list[Path]:
-    """Write `table{1,2,3,4}.{md,csv,tex}` and `significance.csv`; returns their paths."""
+def make_tables(scores: Path, out: Path, rule: ApRule = "mean") -> list[Path]:
+    """Write `table{1,2,3,4}.{md,csv,tex}` and `significance.csv` from a folder of scores.
+
+    Returns:
+        Their paths.
+
+    Raises:
+        StoreError: No such folder, or scores that are damaged or do not fit together.
+    """
+    results = load(scores)
     written: dict[Path, str] = {}
     for table in build(results, rule):
         stem = f"table{table.number}"

@@ -19,8 +19,8 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 from jaxtyping import Float, Int
 
+from scapo.categories import JointKind
 from scapo.store.folders import whole_folder
-from scapo.types import JointKind
 
 RGBA = tuple[float, float, float, float]
 Vector = Float[np.ndarray, "3"]

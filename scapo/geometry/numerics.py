@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import update_wrapper
 from typing import Any, Literal, TypeVar, cast
 
 import torch
@@ -44,6 +45,34 @@ def at_least_float32(tensor: Tensor) -> Tensor:
     return tensor.to(torch.promote_types(tensor.dtype, torch.float32))
 
 
+class _Plain:
+    """A function that a compiler leaves alone."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.call = torch.compiler.disable(function) if _COMPILING else function
+
+    def __call__(self, *inputs: Any, **named: Any) -> Any:  # noqa: ANN401 - as the function
+        return self.call(*inputs, **named)
+
+
+_PLAIN: list[_Plain] = []
+_COMPILING: list[bool] = []
+"""Not empty once something is compiled."""
+
+
 def uncompiled(function: F) -> F:
-    """The function as it is, also where its caller is compiled."""
-    return cast("F", torch.compiler.disable(cast("Any", function)))
+    """The function as it is, also where its caller is compiled (after `before_compiling`).
+
+    As `torch.compiler.disable`, which would load the compiler for those who never compile.
+    """
+    plain = _Plain(function)
+    _PLAIN.append(plain)
+    return cast("F", update_wrapper(plain, function))
+
+
+def before_compiling() -> None:
+    """Keep `uncompiled` functions from the compiler, from now on."""
+    if not _COMPILING:
+        _COMPILING.append(True)
+        for plain in _PLAIN:
+            plain.call = torch.compiler.disable(plain.call)

@@ -131,7 +131,7 @@ def robust_chamfer(
 ) -> Float[Tensor, "*B"]:
     """mean(1 - exp(-f D_ab)) + (f / b) mean(1 - exp(-b D_ba)), D squared distances.
 
-    OP-Align's form for partial clouds (PROTOCOL 3.1, L_rigid), f = `forward`, b = `backward`:
+    OP-Align's form for partial clouds (L_rigid), f = `forward`, b = `backward`:
     a point of the shape far from every observed point costs a bounded amount.
     """
     there = 1 - torch.exp(-forward * squared_distances(a, b))
@@ -141,9 +141,11 @@ def robust_chamfer(
 
 @torch.no_grad()
 def farthest_points(
-    points: Float[Tensor, "*B N 3"], count: int, *, start: int = 0
+    points: Float[Tensor, "*B N D"], count: int, *, start: int = 0
 ) -> Int[Tensor, "*B {count}"]:
     """Indices of farthest-point sampling, beginning with point `start`.
+
+    Points of space, or features of any dimension D.
 
     Raises:
         ValueError: The cloud has fewer than `count` points, or no point `start`.
@@ -153,11 +155,11 @@ def farthest_points(
     if not 0 <= start < points.shape[-2]:
         raise ValueError(f"sampling: expected a start below {points.shape[-2]}, found {start}")
     # On a CPU each of the many small steps would be compiled by itself, for minutes.
-    spread = uncompiled(_spread) if points.device.type == "cpu" else _spread
+    spread = _spread_as_it_is if points.device.type == "cpu" else _spread
     return spread(points, count, start)
 
 
-def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
+def _spread(points: Float[Tensor, "*B N D"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
     chosen = torch.full(points.shape[:-2], start, device=points.device)
     distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
     indices = [chosen]
@@ -169,9 +171,24 @@ def _spread(points: Float[Tensor, "*B N 3"], count: int, start: int) -> Int[Tens
     return torch.stack(indices, -1)
 
 
+_spread_as_it_is = uncompiled(_spread)
+
+
+@torch.no_grad()
+def k_means(
+    points: Float[Tensor, "N D"], centres: Float[Tensor, "K D"], rounds: int
+) -> Float[Tensor, "K D"]:
+    """Centres after rounds of Lloyd's algorithm; one that loses all its points stays."""
+    for _ in range(rounds):
+        label = torch.cdist(points, centres).argmin(-1)
+        means = torch.stack([points[label == k].mean(0) for k in range(len(centres))])
+        centres = torch.where(means.isnan(), centres, means)
+    return centres
+
+
 MEAN_RADIUS = 0.25
-"""Mean distance of the points from their centroid after `normalise` (PROTOCOL 1.7): a length of 1
-is 4 times the mean radius of that cloud."""
+"""Mean distance of the points from their centroid after `normalise`: a length of 1 is
+4 times the mean radius of that cloud."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

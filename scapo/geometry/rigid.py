@@ -6,14 +6,12 @@
 
 from __future__ import annotations
 
-from typing import cast
-
-import roma
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from scapo.types import JointKind
+from scapo.categories import JointKind
+from scapo.geometry.rotations import rotvec_to_rotmat, special_procrustes, unitquat_to_rotmat
 
 
 def rigid(
@@ -59,7 +57,7 @@ def joint_motion(
     if kind == "prismatic":
         eye = torch.eye(3, dtype=step.dtype, device=step.device).expand(*step.shape[:-1], 3, 3)
         return rigid(eye, step)
-    rotation = roma.rotvec_to_rotmat(step)
+    rotation = rotvec_to_rotmat(step)
     return rigid(rotation, pivot - (rotation @ pivot[..., None])[..., 0])
 
 
@@ -140,7 +138,7 @@ def skew_matrix(v: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
 
 def project_rotation(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
     """The rotation nearest to a matrix in the Frobenius norm (SVD, det = +1)."""
-    return cast("Tensor", roma.special_procrustes(matrix))
+    return special_procrustes(matrix)
 
 
 def mean_rotation(
@@ -157,12 +155,4 @@ def random_rotations(
 ) -> Float[Tensor, "{count} 3 3"]:
     """Uniform on SO(3), from normalised Gaussian quaternions, on the generator's device."""
     quaternion = torch.randn(count, 4, generator=generator, device=generator.device, dtype=dtype)
-    return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
-
-
-def is_rotation(matrix: Float[Tensor, "*B 3 3"], tolerance: float = 1e-3) -> Bool[Tensor, "*B"]:
-    """Whether R R^T = I within `tolerance` per entry and det > 0; False for NaN."""
-    matrix = matrix.double()  # no determinant in half precision on the CPU
-    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-    orthogonal = ((matrix @ matrix.mT - eye).abs() < tolerance).all(-1).all(-1)
-    return orthogonal & (torch.linalg.det(matrix) > 0)
+    return unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))

@@ -2,7 +2,7 @@
 """Stage 1: the equivariant encoder Theta_E and the decoder Theta_D (Sec. 3.1).
 
 The encoder is VNT (Katzir et al. 2022), the decoder AtlasNet (Groueix et al. 2018) as VNT uses
-it; sizes are PROTOCOL 4.1's. All lengths are in normalised units (mean radius 0.25).
+it; sizes are docs/method.md's. All lengths are in normalised units (mean radius 0.25).
 """
 
 from __future__ import annotations

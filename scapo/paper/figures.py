@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo.drawing import Panel, PictureData
+from scapo.categories import JointKind
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation, deform_all
 from scapo.paper.skinning import Bones
-from scapo.types import JointKind
+from scapo.pictures import Panel, PictureData
 
 Pictures = dict[str, PictureData]
 

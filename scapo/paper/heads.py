@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from scapo.categories import Category, JointKind
 from scapo.geometry.numerics import at_least_float32
 from scapo.paper.vector_neurons import uniform
-from scapo.types import Category, JointKind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,7 +192,7 @@ class Template(nn.Module):
 
     The paper says where neither starts. Points: Xavier uniform (OP-Align) until `set_to` puts
     the decoded training medoid in their place. Keypoints: one K per shape is our reading
-    (PROTOCOL 4.5), so the template has its own.
+    (docs/method.md), so the template has its own.
     """
 
     def __init__(self, points: int, parts: int) -> None:

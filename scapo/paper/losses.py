@@ -2,7 +2,7 @@
 """The terms of the loss, one pure function each, named as in the paper; weights are the model's.
 
 Sec. 3.1 has the four of stage 1, Sec. 3.2 the cycle and the reconstruction, Sec. 3.3 the
-regularisers. Where two readings exist, the function takes the choice (PROTOCOL 4.3 has the
+regularisers. Where two readings exist, the function takes the choice (docs/method.md has the
 reasons). All return a scalar mean over the batch; lengths are in normalised units.
 """
 

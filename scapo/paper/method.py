@@ -9,7 +9,7 @@ that blend skinning carries the aligned cloud to the template and back. No label
 Frames: `camera` in metres; `input`, the cloud centred and scaled to mean radius 0.25; `aligned`
 (S_obj); `canonical` (S*); `template` (Y_X).
 
-What OP-Align's released evaluator asks of a network (CONTRACT 3, `record_*`).
+What OP-Align's released evaluator asks of a network (`record_*`, docs/bring-your-own-method.md).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.drawing import PictureData
+from scapo.categories import Category, JointKind
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
@@ -42,7 +42,8 @@ from scapo.paper.objectives import Explanation, LossConfig, articulation, canoni
 from scapo.paper.refine import refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
-from scapo.types import Category, JointKind, Joints, Labels, Observation, Prediction
+from scapo.pictures import PictureData
+from scapo.types import Joints, Labels, Observation, Prediction
 
 
 def opalign_record(e: Explanation) -> dict[str, Tensor]:
@@ -137,6 +138,7 @@ class Scapo(AbstractMethod):
         self.config = config
         self.category = category
         self.supervision = frozenset(config.supervision)
+        self.least_points = config.encoder.neighbours
         self.kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         parts, code = len(category.parts), config.encoder.code
         with torch.random.fork_rng(devices=[]):  # layers draw before `initialise` draws again
@@ -285,7 +287,7 @@ class Scapo(AbstractMethod):
 
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
-        """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (PROTOCOL 4.4).
+        """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (docs/method.md).
 
         The part frames are the template's: every part's pose carries the template onto the
         cloud. States are those of the cloud minus the template's. `refine` moves pose and joints

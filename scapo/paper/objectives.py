@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, random_rotations
 from scapo.paper import losses
 from scapo.paper.augment import DISTURBANCES, Disturbance, disturb
@@ -25,14 +26,13 @@ from scapo.paper.skinning import (
     part_maps,
     to_canonical,
 )
-from scapo.types import JointKind
 
 AblatedTerm = Literal["shape_var", "dir_align", "joint_prox", "joint_boundary"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossConfig:
-    """Weights and readings of the loss; defaults are the paper's (Sec. 4) and PROTOCOL 4.3's."""
+    """Weights and readings of the loss; defaults are the paper's (Sec. 4) and docs/method.md's."""
 
     rec: float = 1.0
     rec_aligned: float = 0.1

@@ -10,20 +10,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import roma
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.geometry.points import squared_distances
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation
 from scapo.paper.skinning import cross_maps, deform, part_maps
-from scapo.types import JointKind
 
 SHARPNESS = (30.0, 120.0)
-"""Of the robust distances, cloud to template and back (PROTOCOL 3.1)."""
+"""Of the robust distances, cloud to template and back (OP-Align's)."""
 
 
 def misfit(
@@ -42,7 +42,7 @@ def moved(
     e: Explanation, change: Float[Tensor, "B 6"], joint: Float[Tensor, "B J 7"]
 ) -> Explanation:
     """The explanation with its pose turned and shifted, and its joints changed."""
-    turn = roma.rotvec_to_rotmat(change[:, :3])
+    turn = rotvec_to_rotmat(change[:, :3])
     joints = JointPairs(
         pivot=e.joints.pivot + joint[..., :3],
         axis=F.normalize(e.joints.axis + joint[..., 3:6], dim=-1),

@@ -7,14 +7,14 @@ equations that cannot be used as they stand are named at the functions that corr
 
 from __future__ import annotations
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, joint_motion, mean_rotation, rigid, rotation_between
+from scapo.geometry.rotations import unitquat_to_rotmat
 from scapo.paper.heads import JointPairs
-from scapo.types import JointKind
 
 
 class Bones(nn.Module):
@@ -32,9 +32,7 @@ class Bones(nn.Module):
 
     def precision(self) -> Float[Tensor, "P 3 3"]:
         """Q of each bone, symmetric positive definite."""
-        orientation = roma.unitquat_to_rotmat(
-            torch.nn.functional.normalize(self.quaternion, dim=-1)
-        )
+        orientation = unitquat_to_rotmat(torch.nn.functional.normalize(self.quaternion, dim=-1))
         return orientation.mT @ (self.log_scale.exp()[..., None] * orientation)
 
     def weights(
@@ -92,7 +90,7 @@ def part_maps(incident: Float[Tensor, "B J 2 4 4"]) -> Float[Tensor, "B P 4 4"]:
     """One map per part: the child's side of joint j for part j + 1, the base from all its joints.
 
     With two joints the base has two maps; their mean is used, translations averaged, rotations by
-    the chordal mean (PROTOCOL 4.2). `base_gap` says how far they disagree.
+    the chordal mean (docs/method.md). `base_gap` says how far they disagree.
     """
     base = incident[:, :, 0]  # (B, J, 4, 4)
     if base.shape[1] == 1:

@@ -5,6 +5,10 @@ A job is any picklable value; the function that does it is a module-level functi
 `function(job, report)`, which calls `report(label, amount)` as a sign of life: what it is about to
 do, and how much it has done since the last call. Workers are spawned, with one numerical thread
 each, and end by themselves when the parent is gone.
+
+An error is the job's own. A process that dies or stops need not be: the system may have killed it
+for the memory that others took. So such a job is done again after all others, in a fresh process
+with none beside it, and given up only when that happened `TRIES` times at the same place.
 """
 
 from __future__ import annotations
@@ -14,13 +18,13 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar, cast
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -38,6 +42,8 @@ TICK = 0.5
 """Seconds between looks at the clock."""
 START = 120.0
 """Seconds that a worker may take to start and to import what it needs."""
+TRIES = 3
+"""Processes that may die or hang at one label of a job before the job is given up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,14 +58,23 @@ class Outcome(Generic[Job, Result]):
     """What the job reported last."""
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Attempt:
+    """A job, what it reported since it was begun, and where its processes were lost."""
+
+    job: Any
+    label: str = ""
+    amount: int = 0
+    lost: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
 class _Worker:
     process: Any
     pipe: Connection
-    job: Any = None
-    busy: bool = False
+    attempt: _Attempt | None = None
+    """None: idle."""
     begun: bool = False
-    label: str = ""
     heard: float = 0.0
 
 
@@ -78,7 +93,8 @@ class AbstractPool(ABC, Generic[Job, Result]):
         Args:
             function: Module-level, does one job.
             jobs: Handed out in order.
-            on_report: Called in this process with the job and each of its reports.
+            on_report: Called in this process with the job and each of its reports; the amounts of
+                an attempt that was lost are reported back as negative.
         """
 
     @abstractmethod
@@ -118,34 +134,51 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
         on_report: Callable[[Job, str, int], None] | None = None,
     ) -> Iterator[Outcome[Job, Result]]:
         """See `AbstractPool.run`."""
-        waiting = deque(jobs)
         if not self.size:
-            yield from (_do_here(function, job, on_report) for job in waiting)
+            yield from (_do_here(function, job, on_report) for job in jobs)
             return
+        waiting, again = deque(_Attempt(job=job) for job in jobs), deque[_Attempt]()
         try:
-            while waiting or any(worker.busy for worker in self._workers):
-                self._hand_out(function, waiting)
-                ready = wait([worker.pipe for worker in self._workers if worker.busy], TICK)
-                for worker in [w for w in self._workers if w.busy]:
+            while waiting or again or self._busy():
+                self._hand_out(function, waiting, again)
+                ready = wait([worker.pipe for worker in self._busy()], TICK)
+                for worker in self._busy():
                     outcome = self._listen(worker, worker.pipe in ready, on_report)
-                    if outcome is not None:
-                        worker.busy = False
+                    if outcome is None:
+                        continue
+                    attempt, worker.attempt = cast("_Attempt", worker.attempt), None
+                    if _is_given_up(attempt, outcome):
                         yield outcome
+                        continue
+                    if on_report is not None:
+                        on_report(attempt.job, attempt.label, -attempt.amount)
+                    attempt.label, attempt.amount = "", 0
+                    again.append(attempt)
         finally:  # left before the end: the next run would take their outcomes for its own
-            for worker in [w for w in self._workers if w.busy]:
+            for worker in self._busy():
                 self._drop(worker)
 
-    def _hand_out(self, function: Callable[..., Any], waiting: deque[Any]) -> None:
-        idle = [worker for worker in self._workers if not worker.busy]
+    def _busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.attempt is not None]
+
+    def _hand_out(
+        self, function: Callable[..., Any], waiting: deque[_Attempt], again: deque[_Attempt]
+    ) -> None:
+        alone = not waiting and bool(again) and not self._busy()
+        if alone:
+            for worker in list(self._workers):
+                self._drop(worker)
+            waiting = deque([again.popleft()])
+        idle = [worker for worker in self._workers if worker.attempt is None]
         while waiting and (idle or len(self._workers) < self.size):
             worker = idle.pop() if idle else self._start()
             try:
-                worker.pipe.send((function, waiting[0]))
+                worker.pipe.send((function, waiting[0].job))
             except (BrokenPipeError, ConnectionResetError):  # it died while idle
                 self._drop(worker)
                 continue
-            worker.job, worker.label = waiting.popleft(), ""
-            worker.busy, worker.begun, worker.heard = True, False, time.monotonic()
+            worker.attempt = waiting.popleft()
+            worker.begun, worker.heard = False, time.monotonic()
 
     def _start(self) -> _Worker:
         context = get_context("spawn")
@@ -165,6 +198,7 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
         on_report: Callable[[Job, str, int], None] | None,
     ) -> Outcome[Job, Result] | None:
         """The outcome of the worker's job if it has ended."""
+        attempt = cast("_Attempt", worker.attempt)
         try:
             while ready and worker.pipe.poll():
                 kind, *content = worker.pipe.recv()
@@ -172,21 +206,21 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
                 if kind == "begun":
                     worker.begun = True
                 elif kind == "report":
-                    worker.label = content[0]
+                    attempt.label = content[0]
+                    attempt.amount += content[1]
                     if on_report is not None:
-                        on_report(worker.job, *content)
+                        on_report(attempt.job, *content)
                 else:
                     result, reason = content
-                    return _outcome(worker, result, "error" if kind == "error" else None, reason)
-        except (EOFError, ConnectionResetError):
+                    return _outcome(attempt, result, "error" if kind == "error" else None, reason)
+        except (EOFError, OSError):  # before or amid a message
             worker.process.join(timeout=5)  # so that its exit code is known
             self._drop(worker)
-            return _outcome(worker, None, "died", _cause(worker.process.exitcode))
+            return _outcome(attempt, None, "died", _cause(worker.process.exitcode))
         limit = self.timeout if worker.begun else max(self.timeout, START)
         if time.monotonic() - worker.heard > limit:
             self._drop(worker)
-            reason = f"no sign of life for {limit:g} s"
-            return _outcome(worker, None, "hung", reason)
+            return _outcome(attempt, None, "hung", f"no sign of life for {limit:g} s")
         return None
 
     def _drop(self, worker: _Worker) -> None:
@@ -215,20 +249,28 @@ def _do_here(
         return Outcome(job=job, result=None, failure="error", reason=reason, label=last)
 
 
+def _is_given_up(attempt: _Attempt, outcome: Outcome[Any, Any]) -> bool:
+    """Whether an outcome is final; counts the processes that were lost at its label."""
+    if outcome.failure not in ("died", "hung"):
+        return True
+    attempt.lost[outcome.label] += 1
+    return attempt.lost[outcome.label] >= TRIES
+
+
 def _outcome(
-    worker: _Worker,
+    attempt: _Attempt,
     result: Any,  # noqa: ANN401
     failure: Literal["error", "died", "hung"] | None,
     reason: str,
 ) -> Outcome[Any, Any]:
     return Outcome(
-        job=worker.job, result=result, failure=failure, reason=reason, label=worker.label
+        job=attempt.job, result=result, failure=failure, reason=reason, label=attempt.label
     )
 
 
 def _end(worker: _Worker) -> None:
     worker.pipe.close()  # an idle worker ends at once
-    worker.process.join(timeout=0 if worker.busy else 2)
+    worker.process.join(timeout=2 if worker.attempt is None else 0)
     if worker.process.is_alive():
         worker.process.kill()
         worker.process.join()

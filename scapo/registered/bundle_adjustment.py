@@ -1,205 +1,184 @@
 # SPDX-License-Identifier: MIT
-"""One optimisation of template, parts, joints and all placements against the views.
+"""Bundle adjustment: template, parts, joints and all placements fitted to the views together.
 
-The loss of a view: every observed point must lie on the placed template with the same normal
-(robust, so that details missing from the template cost a bounded amount), and every template
-point that this camera would have seen must have been seen. Template points that something hides
-or that face away cost nothing. States are searched over a grid now and then, so that a view does
-not stay in a wrong one.
+`bundle_adjust` is one optimisation of `view_loss` by Adam. States are searched over a grid now and
+then, so that a view does not stay in a wrong one. Parts do not leave a wrong place by small steps
+either: rounds of rebuilding them (`motion_segmentation`), fixing what the views leave open
+(`gauge`) and adjusting make a template, first from a proposal (`first_fit`), later from the inliers
+of a search (`refit`), at last with more points (`densified`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import roma
 import torch
-import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from scapo.geometry.points import gather
-from scapo.registered.pairwise import NORMAL_WEIGHT
+from scapo.categories import JointKind
+from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.records import map_tensors
+from scapo.registered.config import DiscoveryConfig
+from scapo.registered.gauge import along_main_directions, choose_axes, tells_frame
+from scapo.registered.joint_limits import limits_of
+from scapo.registered.motion_segmentation import rebuild
+from scapo.registered.pose_refinement import SCALE_WEIGHT, SHIFT_WEIGHT, SLIDE_WEIGHT, search_states
 from scapo.registered.template import ArticulatedTemplate, Placement, slides
-from scapo.registered.views import Views, free_and_hidden
+from scapo.registered.view_loss import sharpened, view_loss
+from scapo.registered.views import PartialViews
 
-SHIFTS = tuple(0.05 * k for k in range(-5, 6))
-"""Places of a sliding part across its joint's axis that are tried; the mean radius is 0.25."""
-NORMAL_LENGTH = 0.06
-"""A unit of normal difference counts as this length when neighbours are sought."""
-POINTS = 128
-"""Of each view, drawn anew every step of `fit`."""
-SCALE_WEIGHT = 0.05
-"""Of the squared log scales."""
-SHIFT_WEIGHT = 0.2
-"""Of a sliding part's squared place across its axis, per squared normalised length."""
-SLIDE_WEIGHT = 0.7
-"""Of a sliding joint's states about their mean: without it a part slides right through the body to
-explain its far side."""
+POINTS = 128  # Of each view, drawn anew every step
+BETAS = (0.8, 0.95)  # Of Adam, shorter memories than usual: there are few steps
+LAST_RATE, FALLING = 0.1, 0.4
+"""Share of every rate at the end, and share of the steps over which it falls."""
+TURN_RATE, STATE_RATE, SLIDING_RATE = 0.02, 0.03, 0.01
+"""Rad a step; a state's where all joints slide is in normalised lengths."""
+TRANSLATION_RATE, SHIFT_RATE, SCALE_RATE = 0.004, 0.006, 0.008
+"""Normalised lengths, and log scales, a step."""
+POINT_RATE, PIVOT_RATE = 0.002, 0.012  # Normalised lengths a step; pivots may be far off at first
+LOGIT_RATE, AXIS_RATE = 0.06, 0.05
+"""Logits of parts, and of an axis of length 1 about its own direction, a step."""
+MEAN_SCALE_WEIGHT, MEAN_STATE_WEIGHT = 0.5, 0.02
+"""Of the squared mean log scales and states of all views, which the template can take over."""
+MASS_WEIGHT, LEAST_MASS = 10.0, 0.06
+"""Cost of a part with fewer than this share of the template's points."""
+FIRST_STATES = {"revolute": 1.7, "prismatic": 0.25}
+"""Largest state, to either side, before anything is known: rad, and normalised length."""
+FIRST_GRID, GRID = 13, 11  # States tried of each joint before anything is known, and later
+ROUNDS = 4  # Of rebuilding and adjusting
+FIRST_STEPS, FIRST_SEARCHED, LAST_STEPS = 30, (0, 15), 20
+"""Of a first fit: steps of each round, where states are searched in them, steps after the last."""
+LATE_STEPS = 25  # Of each round on inliers
+BLUNT, SHARP, SHARPEST = (60.0, 200.0), (120.0, 300.0), (150.0, 400.0)
+"""Sharpness (of `match_weight`) at the first and last step: of the first round, of the others of a
+first fit, and of those on inliers."""
+ROOM = 0.25  # Share of their range beyond which states of hinges are searched again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitOptions:
-    """Of one call of `fit`."""
+    """Of one call of `bundle_adjust`."""
 
     steps: int = 40
-    sharpness: tuple[float, float] = (120.0, 300.0)
-    """Of the robust distance, per squared normalised length, at the beginning and the end."""
+    sharpness: tuple[float, float] = SHARP
+    """Of `match_weight`, per squared normalised length, at the beginning and the end."""
     search_states: tuple[int, ...] = ()
     """Steps at which every state is searched over `states`."""
     axis_weight: float = 0.0
     """Pull of each joint axis to the nearest axis of the template frame, a Manhattan frame."""
 
 
-@torch.no_grad()
-def oriented_nearest(
-    points: Float[Tensor, "B K 3"],
-    normals: Float[Tensor, "B K 3"],
-    target: Float[Tensor, "B M 3"],
-    target_normals: Float[Tensor, "B M 3"],
-) -> Int[Tensor, "B K"]:
-    """Nearest target in position and normal: the two faces of a thin plate are told apart."""
-    source = torch.cat([points, NORMAL_LENGTH * normals], -1)
-    goal = torch.cat([target, NORMAL_LENGTH * target_normals], -1)
-    return (goal.square().sum(-1)[:, None] - 2 * source @ goal.mT).argmin(-1)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inliers:
+    """Views that a template explains, and their placements on it."""
+
+    views: PartialViews
+    placement: Placement
+
+    def cameras(self) -> Float[Tensor, "B 3"]:
+        """Directions to the cameras in the template frame."""
+        direction = self.views.direction()[:, :, None]
+        return (self.placement.rotation.mT @ direction)[..., 0]
 
 
-def view_loss(
-    views: Views,
-    placed: tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]],
-    sharpness: float,
-    backward: float = 1.0,
-) -> Float[Tensor, " B"]:
-    """Robust distance of each view to a placed template, both ways, self-occlusion respected.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A template on its way, and the views it was last fitted to."""
 
-    Args:
-        views: B views.
-        placed: Points and normals of the template in each view.
-        sharpness: k in 1 - exp(-k d^2).
-        backward: Weight of the template's visible points.
-    """
-    points, normals = placed
-    index = oriented_nearest(views.points, views.normals, points, normals)
-    off = (views.points - gather(points, index)).square().sum(-1)
-    cosine = (views.normals * gather(normals, index)).sum(-1)
-    there = 1 - torch.exp(-sharpness * off - NORMAL_WEIGHT * (1 - cosine))
-    with torch.no_grad():
-        counts = should_be_seen(views, points, normals).to(points.dtype)
-        back = oriented_nearest(points, normals, views.points, views.normals)
-    off = (points - gather(views.points, back)).square().sum(-1)
-    return there.mean(-1) + backward * ((1 - torch.exp(-sharpness * off)) * counts).mean(-1)
+    template: ArticulatedTemplate
+    inliers: Inliers
 
 
-@torch.no_grad()
-def should_be_seen(
-    views: Views, points: Float[Tensor, "B M 3"], normals: Float[Tensor, "B M 3"]
-) -> Bool[Tensor, "B M"]:
-    """Whether the camera would have seen each placed template point."""
-    free, hidden = free_and_hidden(views, points, 0.03)
-    ray = F.normalize(views.camera[:, None] - points, dim=-1)
-    return free | (((normals * ray).sum(-1) > 0.1) & ~hidden)
-
-
-def thin(views: Views, index: Int[Tensor, " K"]) -> Views:
-    """The views with these points only."""
-    return replace(views, points=views.points[:, index], normals=views.normals[:, index])
-
-
-@torch.no_grad()
-def search_states(
+def first_fit(
     template: ArticulatedTemplate,
-    views: Views,
+    views: PartialViews,
     placement: Placement,
-    states: Float[Tensor, "J S"],
-    sharpness: float,
-) -> Placement:
-    """Each joint's best state of a grid, the others held, the present state among them.
-
-    Of a sliding joint also its part's best place across the axis, of `SHIFTS`.
-    """
-    for j, kind in enumerate(template.kinds):
-        here = placement.state[:, j : j + 1]
-        tried = torch.cat([here, states[j].to(here).expand(len(here), -1)], 1)
-        moved = torch.zeros_like(placement.state)
-        moved[:, j] = 1.0
-        options = [
-            replace(placement, state=placement.state + (column[:, None] - here) * moved)
-            for column in tried.T
-        ]
-        placement = _best_option(template, views, placement, options, sharpness)
-        if kind != "prismatic":
-            continue
-        for across in across_axis(template.directions()[j]):
-            place = placement.shift @ across
-            options = [placement]
-            for amount in SHIFTS:
-                step = (moved * (amount - place))[..., None] * across
-                options.append(replace(placement, shift=placement.shift + step))
-            placement = _best_option(template, views, placement, options, sharpness)
-    return placement
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> tuple[Placement, Float[Tensor, " B"]]:
+    """Rounds from a proposal, states unknown; a sliding joint gets its axis after the first."""
+    kinds, axis_weight = template.kinds, 0.0
+    states = wide_states(kinds)
+    for number in range(ROUNDS):
+        options = FitOptions(
+            steps=FIRST_STEPS,
+            sharpness=BLUNT if number == 0 else SHARP,
+            search_states=FIRST_SEARCHED,
+            axis_weight=axis_weight,
+        )
+        placement, _ = bundle_adjust(
+            template, views, placement, options, states=states, generator=generator
+        )
+        if number == 0 and config.way_out and "prismatic" in kinds:
+            placement = choose_axes(template, placement, torch.eye(3))
+            axis_weight = config.axis_weight
+        rebuild(template, views, placement, generator=generator)
+    options = FitOptions(steps=LAST_STEPS, axis_weight=axis_weight)
+    return bundle_adjust(template, views, placement, options, generator=generator)
 
 
-def across_axis(axis: Float[Tensor, " 3"]) -> Float[Tensor, "2 3"]:
-    """Two unit directions at right angles to an axis and each other, by the template's frame."""
-    least = F.one_hot(axis.abs().argmin(), 3).to(axis)
-    first = F.normalize(torch.linalg.cross(axis, least), dim=0)
-    return torch.stack([first, torch.linalg.cross(axis, first)])
+def wide_states(
+    kinds: tuple[JointKind, ...], count: int = FIRST_GRID
+) -> Float[Tensor, "J {count}"]:
+    """All that a joint could do, before anything is known."""
+    ends = [FIRST_STATES[kind] for kind in kinds]
+    return torch.stack([torch.linspace(-end, end, count) for end in ends])
 
 
-def _best_option(
-    template: ArticulatedTemplate,
-    views: Views,
-    placement: Placement,
-    options: list[Placement],
-    sharpness: float,
-) -> Placement:
-    """For each view the states and shifts of that of the placements which has the least loss."""
-    loss = [view_loss(views, template.place(option), sharpness) for option in options]
-    best = torch.stack(loss).argmin(0)
-    every = torch.arange(len(best), device=best.device)
-    return replace(
-        placement,
-        state=torch.stack([option.state for option in options])[best, every],
-        shift=torch.stack([option.shift for option in options])[best, every],
+def refit(
+    candidate: Candidate, config: DiscoveryConfig, generator: torch.Generator, rounds: int = ROUNDS
+) -> Candidate:
+    """Rounds on the inliers; the template changes in place."""
+    template, views = candidate.template, candidate.inliers.views
+    placement = candidate.inliers.placement
+    sliding, states = "prismatic" in template.kinds, None
+    for number in range(rounds):
+        rebuild(template, views, placement, generator=generator)
+        if config.held_frame:
+            placement = along_main_directions(template, placement)
+        if number == 0:
+            if config.way_out:  # a first template whose parts were poor may have taken a wrong one
+                placement = choose_axes(template, placement, torch.eye(3))
+            around = limits_of(placement.state, template.kinds)
+            states = around.wider(0.0 if sliding else ROOM).grid(GRID)
+        search_at = (0,) if sliding or number < rounds // 2 else ()
+        options = late_options(template, config, search_at)
+        placement, _ = bundle_adjust(
+            template, views, placement, options, states=states, generator=generator
+        )
+    return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
+
+
+def densified(
+    candidate: Candidate, config: DiscoveryConfig, generator: torch.Generator
+) -> Candidate:
+    """Another template, of `final_points`, built from and fitted to the same views."""
+    views, placement = candidate.inliers.views, candidate.inliers.placement
+    dense = candidate.template.with_points(config.final_points)
+    rebuild(dense, views, placement, generator=generator)
+    if config.way_out:
+        placement = choose_axes(dense, placement, torch.eye(3))
+    options = late_options(dense, config)
+    placement, _ = bundle_adjust(dense, views, placement, options, generator=generator)
+    return Candidate(template=dense, inliers=Inliers(views=views, placement=placement))
+
+
+def late_options(
+    template: ArticulatedTemplate, config: DiscoveryConfig, search_states: tuple[int, ...] = ()
+) -> FitOptions:
+    """Of a fit to inliers; axes are pulled to the template's frame where its base tells it."""
+    return FitOptions(
+        steps=LATE_STEPS,
+        sharpness=SHARPEST,
+        search_states=search_states,
+        axis_weight=config.axis_weight if tells_frame(template) else 0.0,
     )
 
 
-class _Free:
-    """The placement's variables while it is optimised: the rotation as a turn of the start."""
-
-    def __init__(self, start: Placement, template: ArticulatedTemplate) -> None:
-        self.start = start
-        self.turn = torch.zeros_like(start.translation).requires_grad_()
-        self.translation = start.translation.detach().clone().requires_grad_()
-        self.log_scale = start.log_scale.detach().clone().requires_grad_()
-        self.state = start.state.detach().clone().requires_grad_()
-        self.shift = start.shift.detach().clone().requires_grad_()
-        self.slides = slides(template)
-        state_rate = 0.01 if bool(self.slides.all()) else 0.03
-        rates = (
-            (self.turn, 0.02),
-            (self.translation, 0.004),
-            (self.log_scale, 0.008),
-            (self.state, state_rate),
-            (self.shift, 0.006),
-        )
-        self.groups = [{"params": [p], "lr": lr} for p, lr in rates]
-
-    def placement(self, axis: Float[Tensor, "J 3"]) -> Placement:
-        along = (self.shift * axis).sum(-1, keepdim=True) * axis
-        return Placement(
-            rotation=roma.rotvec_to_rotmat(self.turn) @ self.start.rotation,
-            translation=self.translation,
-            log_scale=self.log_scale,
-            state=self.state,
-            shift=(self.shift - along) * self.slides,
-            lean=self.start.lean,
-        )
-
-
-def fit(
+def bundle_adjust(
     template: ArticulatedTemplate,
-    views: Views,
+    views: PartialViews,
     start: Placement,
     options: FitOptions,
     *,
@@ -212,18 +191,21 @@ def fit(
         The placements and the loss of each view at the last step.
     """
     free = _Free(start, template)
-    groups = [*free.groups, *_shared_groups(template)]
-    optimiser = torch.optim.Adam(groups, betas=(0.8, 0.95))
-    rates = [group["lr"] for group in groups]
+    shared = _groups(
+        (template.points, POINT_RATE),
+        (template.logit, LOGIT_RATE),
+        (template.axis, AXIS_RATE),
+        (template.pivot, PIVOT_RATE),
+    )
+    optimiser = torch.optim.Adam([*free.groups, *shared], betas=BETAS)
+    rates = [group["lr"] for group in optimiser.param_groups]
     loss = start.translation.new_zeros(len(start.translation))
-    for step in range(options.steps):
+    for step, sharpness in enumerate(sharpened(options.sharpness, options.steps)):
         done = step / max(options.steps - 1, 1)
-        low, high = options.sharpness
-        sharpness = low * (high / low) ** done
         for group, rate in zip(optimiser.param_groups, rates, strict=True):
-            group["lr"] = rate * min(1.0, max(0.1, (1 - done) / 0.4))
+            group["lr"] = rate * min(1.0, max(LAST_RATE, (1 - done) / FALLING))
         index = torch.randperm(views.points.shape[1], generator=generator, device=generator.device)
-        some = thin(views, index[:POINTS])
+        some = views.thinned(index[:POINTS])
         if states is not None and step in options.search_states:
             found = search_states(
                 template, some, free.placement(template.directions()), states, sharpness
@@ -238,33 +220,60 @@ def fit(
         optimiser.step()
     with torch.no_grad():
         placement = free.placement(template.directions())
-    return placement.detach(), loss.detach()
+    return map_tensors(placement, Tensor.detach), loss.detach()
 
 
-def _shared_groups(template: ArticulatedTemplate) -> list[dict[str, object]]:
-    rates = (
-        (template.points, 0.002),
-        (template.logit, 0.06),
-        (template.axis, 0.05),
-        (template.pivot, 0.012),
-    )
-    return [{"params": [p], "lr": lr} for p, lr in rates]
+class _Free:
+    """The placement's variables while it is optimised: the rotation as a turn of the start."""
+
+    def __init__(self, start: Placement, template: ArticulatedTemplate) -> None:
+        self.start = start
+        self.turn = torch.zeros_like(start.translation).requires_grad_()
+        self.translation = start.translation.detach().clone().requires_grad_()
+        self.log_scale = start.log_scale.detach().clone().requires_grad_()
+        self.state = start.state.detach().clone().requires_grad_()
+        self.shift = start.shift.detach().clone().requires_grad_()
+        self.slides = slides(template)
+        sliding = bool(self.slides.all())
+        self.groups = _groups(
+            (self.turn, TURN_RATE),
+            (self.translation, TRANSLATION_RATE),
+            (self.log_scale, SCALE_RATE),
+            (self.state, SLIDING_RATE if sliding else STATE_RATE),
+            (self.shift, SHIFT_RATE),
+        )
+
+    def placement(self, axis: Float[Tensor, "J 3"]) -> Placement:
+        along = (self.shift * axis).sum(-1, keepdim=True) * axis
+        return Placement(
+            rotation=rotvec_to_rotmat(self.turn) @ self.start.rotation,
+            translation=self.translation,
+            log_scale=self.log_scale,
+            state=self.state,
+            shift=(self.shift - along) * self.slides,
+            deviation=self.start.deviation,
+        )
+
+
+def _groups(*rates: tuple[Tensor, float]) -> list[dict[str, object]]:
+    return [{"params": [parameter], "lr": rate} for parameter, rate in rates]
 
 
 def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOptions) -> Tensor:
     """What the views leave open: all that is not a pose near zero, no part without points.
 
-    Instances whose axes lean to either side of the category's are explained a little better by an
-    axis that leans far to a third side; axes of made things mostly follow their main directions.
+    Instances whose axes deviate to either side of the category's are explained a little better by
+    an axis that deviates far to a third side; axes of made things mostly follow their main
+    directions.
     """
     scale = placement.log_scale
     gauge = SCALE_WEIGHT * scale.square().sum(-1).mean()
-    gauge = gauge + 0.5 * scale.mean(0).square().sum()
-    gauge = gauge + 0.02 * placement.state.mean(0).square().sum()
+    gauge = gauge + MEAN_SCALE_WEIGHT * scale.mean(0).square().sum()
+    gauge = gauge + MEAN_STATE_WEIGHT * placement.state.mean(0).square().sum()
     gauge = gauge + SHIFT_WEIGHT * placement.shift.square().sum((1, 2)).mean()
     spread = (placement.state - placement.state.mean(0)).square() @ slides(template)
     gauge = gauge + SLIDE_WEIGHT * spread.mean()
     askew = 1 - template.directions().square().amax(-1)
     gauge = gauge + options.axis_weight * askew.sum()
     mass = template.logit.softmax(-1).mean(0)
-    return gauge + 10 * (0.06 - mass).clamp_min(0).sum()
+    return gauge + MASS_WEIGHT * (LEAST_MASS - mass).clamp_min(0).sum()

@@ -11,15 +11,12 @@ from torch import Tensor
 
 from scapo.geometry.points import Similarity, k_nearest
 from scapo.geometry.rigid import rigid
-from scapo.registered.bundle_adjustment import NORMAL_LENGTH
-from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, slides
+from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
 from scapo.registered.views import surface_normals
 from scapo.types import Joints, Prediction
 
-NEIGHBOURS = 12
-"""Template points that tell the part of an observed one."""
-REACH = 0.04
-"""Of their weights, normalised length; a unit of normal difference counts as `NORMAL_LENGTH`."""
+NEIGHBOURS = 12  # Template points that tell the part of an observed one
+REACH = 0.04  # Of their weights, normalised length; normals count as in `oriented`
 
 
 @torch.no_grad()
@@ -32,7 +29,7 @@ def placed_prediction(
 ) -> Prediction:
     """The prediction that a placement in normalised frames stands for.
 
-    States and part frames are those from the template's own state, or where hinges lean from their
+    States and part frames are those from the template's own state, or where axes deviate from their
     rest, so that every part is its base moved by its joint.
 
     Args:
@@ -61,7 +58,7 @@ def placed_prediction(
 def _from_rest(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
     """view_T_part with frames that all parts share with the base when hinges are at their rest."""
     poses = template.part_poses(placement)
-    if not template.leans():
+    if not template.deviates():
         return poses
     rested = template.part_poses(_at_rest(template, placement))
     turn = poses.rotation @ rested.rotation.mT
@@ -73,7 +70,7 @@ def _from_rest(template: ArticulatedTemplate, placement: Placement) -> PartPoses
 
 
 def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
-    """The placement with hinges that lean at their rest, others at the template's own state."""
+    """The placement with axes that deviate at their rest, others at the template's own state."""
     return replace(placement, state=template.rest.expand_as(placement.state))
 
 
@@ -98,8 +95,7 @@ def nearest_weights(
     """Part weights of the placed template's points that are nearest in position and normal."""
     normals = surface_normals(points, points, camera)
     placed, placed_normals = template.place(placement)
-    source = torch.cat([points, NORMAL_LENGTH * normals], -1)
-    target = torch.cat([placed, NORMAL_LENGTH * placed_normals], -1)
+    source, target = oriented(points, normals), oriented(placed, placed_normals)
     weight = template.logit.softmax(-1)
     return torch.stack(
         [smoothed(one, other, weight) for one, other in zip(source, target, strict=True)]

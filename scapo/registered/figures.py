@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the registered variant shows of its training: the template, and where it puts it."""
+"""What the registered method shows of its training: the template, and where it puts it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.drawing import Panel, PictureData
-from scapo.registered.joint_limits import StateRange
+from scapo.pictures import Panel, PictureData
+from scapo.registered.joint_limits import JointLimits
 from scapo.registered.template import ArticulatedTemplate, Placement
 
 
 def template_pictures(
     template: ArticulatedTemplate,
-    states: StateRange,
+    limits: JointLimits,
     clouds: Float[Tensor, "B K 3"],
     placement: Placement,
 ) -> dict[str, PictureData]:
@@ -22,12 +22,12 @@ def template_pictures(
 
     Args:
         template: Found.
-        states: Of the trusted clouds.
+        limits: Of the inliers' states.
         clouds: Normalised.
         placement: Of the clouds, as the network votes.
     """
     part = template.logit.argmax(-1)
-    grid = states.grid(3).T
+    grid = limits.grid(3).T
     turn = torch.eye(3).to(clouds).expand(len(grid), 3, 3)
     poses = Placement.at(turn, clouds.new_zeros(len(grid), 3), grid)
     pivot, axis = template.joints_in_view(poses)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Which of a part's translations is its joint's: the one that takes it out of the body.
+"""What the views leave open of a template, and is fixed by rule: sliding axes, and its frame.
 
-A part without rotation differs from view to view by a translation, for two reasons: its joint is
-open by some amount, and in each instance it sits elsewhere on the body (one of several drawers of
-a cabinet). Single views do not tell the two apart, and the second may be the larger. But a part
-that moves leaves the body's outline, while where it sits is within. So the whole translation is
-free while the template is fitted, and the main direction along which the part comes out of the body
-is made the joint's axis; what remains is the instance's shift.
+Which of a part's translations is its joint's? A part without rotation differs from view to view by
+a translation, for two reasons: its joint is open by some amount, and in each instance it sits
+elsewhere on the body (one of several drawers of a cabinet). Single views do not tell the two apart,
+and the second may be the larger. But a part that moves leaves the body's outline, while where it
+sits is within. So the whole translation is free while the template is fitted, and the main
+direction along which the part comes out of the body is made the joint's axis; what remains is the
+instance's shift.
+
+The frame of a template is fixed by the main directions of its base (a Manhattan frame).
 """
 
 from __future__ import annotations
@@ -14,13 +17,26 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.geometry.rigid import project_rotation
+from scapo.registered.pairwise import rotation_grid
 from scapo.registered.template import ArticulatedTemplate, Placement
 
-EDGE = 0.97
-"""Quantile of points that counts as the end of a body: single points say little."""
+EDGE = 0.97  # Quantile of points that counts as the end of a body: single points say little
+OPEN = (0.1, 0.9)  # Quantiles of the views between which a part's way out of the body is measured
+FRAMES = 1500  # Rotations of the grid of frames, about 18 degrees apart
+PICKED, SETTLED = 8.0, 12.0
+"""Sharpness of exp(-k (1 - cosine)), by which normals count for the nearest direction of a frame,
+when one is picked from the grid and when it is settled among them."""
+SETTLING = 20  # Steps in which a frame settles
+TOLD = 0.05  # Share of the base's normals that a direction needs to be one of its main ones
+LOST = 0.2  # Where no direction of a frame has this share, the frame is sought anew
+NEAR = 0.9  # Cosine of normals that count for it
+ASIDE = 0.3
+"""Sine of the angle between an axis and the held direction from which on it tells the others."""
 
 
 @torch.no_grad()
@@ -74,7 +90,8 @@ def choose_axes(
             continue
         offset = shift[:, j] + state[:, j, None] * template.directions()[j]
         out = protrusion(template, placement, offset, j, both)
-        spread = out.quantile(0.9, dim=0) - out.quantile(0.1, dim=0)
+        low, high = OPEN
+        spread = out.quantile(high, dim=0) - out.quantile(low, dim=0)
         if not spread.max() > 0:  # it comes out nowhere: the axis stays
             continue
         axis = both[spread.argmax()]
@@ -86,3 +103,93 @@ def choose_axes(
         state[:, j] = rest @ axis
         shift[:, j] = rest - state[:, j, None] * axis
     return replace(placement, state=state, shift=shift)
+
+
+@torch.no_grad()
+def principal_frame(normals: Float[Tensor, "K 3"]) -> Float[Tensor, "3 3"]:
+    """Rows: the orthogonal directions that most normals follow (a Manhattan frame).
+
+    Shapes without such directions get the best there is: any frame will do for them.
+    """
+    rotations = rotation_grid(FRAMES).to(normals)
+    aligned = torch.stack([(normals @ r.T).abs().amax(-1) for r in rotations])
+    return _settled(normals, rotations[torch.exp(-PICKED * (1 - aligned)).mean(-1).argmax()])
+
+
+@torch.no_grad()
+def along_main_directions(template: ArticulatedTemplate, placement: Placement) -> Placement:
+    """Turn the template's frame to the main directions of its base that are nearest, in place.
+
+    While shape, axes and all placements are fitted together nothing holds the frame: the whole
+    template can turn in it. What is said of directions (axes along the main ones, scales along the
+    frame's) then means something else in every round. Scales keep their numbers along the new
+    axes: with unequal ones the placed template changes a little. A flat base tells one direction
+    only; about it the frame follows the first joint's axis.
+
+    Returns:
+        The placements of the turned template.
+    """
+    base = template.logit.argmax(-1) == 0
+    normals = template.normals[base]
+    frame = _settled(normals, torch.eye(3).to(normals))
+    told = _support(normals, frame)
+    if told.max() < LOST:
+        frame = principal_frame(normals)
+        told = _support(normals, frame)
+    if told.sort().values[1] < TOLD:
+        frame = _turned_to(frame, int(told.argmax()), template.directions()[0])
+    for vectors in (template.points, template.normals, template.axis, template.pivot):
+        vectors.copy_(vectors @ frame.T)
+    return replace(
+        placement,
+        rotation=placement.rotation @ frame.T,
+        shift=placement.shift @ frame.T,
+        deviation=placement.deviation @ frame.T,
+    )
+
+
+@torch.no_grad()
+def tells_frame(template: ArticulatedTemplate) -> bool:
+    """Whether the normals of the base follow two directions of the template's frame at least.
+
+    Those of a plate follow one. About it the frame follows the hinge, so a pull of the hinge to
+    the frame would hold it wherever it began.
+    """
+    normals = template.normals[template.logit.argmax(-1) == 0]
+    return bool(_support(normals, torch.eye(3).to(normals)).sort().values[1] >= TOLD)
+
+
+def _settled(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
+    """The orthogonal directions near those of `frame` that most normals follow."""
+    for _ in range(SETTLING):
+        projected = normals @ frame.T
+        axis = projected.abs().argmax(-1)
+        along = projected.gather(1, axis[:, None])
+        weight = torch.exp(-SETTLED * (1 - along.abs())) * along.sign()
+        rows = torch.stack([(normals * weight)[axis == c].sum(0) for c in range(3)])
+        frame = project_rotation(F.normalize(rows, dim=-1))
+    return frame
+
+
+def _support(normals: Float[Tensor, "K 3"], frame: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+    """Share of the normals near each direction, either sign."""
+    near = (normals @ frame.T).abs() > NEAR
+    return near.float().sum(0) / max(len(normals), 1)
+
+
+def _turned_to(
+    frame: Float[Tensor, "3 3"], held: int, axis: Float[Tensor, " 3"]
+) -> Float[Tensor, "3 3"]:
+    """The frame turned about its direction `held` until another one lies along the axis."""
+    across = axis - (axis @ frame[held]) * frame[held]
+    if across.norm() < ASIDE:  # the axis is the held direction: nothing tells the others
+        return frame
+    across = F.normalize(across, dim=0)
+    along = frame @ across
+    along[held] = 0
+    first = int(along.abs().argmax())
+    rows = frame.clone()
+    rows[first] = across * along[first].sign()
+    last = 3 - held - first
+    rows[last] = torch.linalg.cross(rows[(last + 1) % 3], rows[(last + 2) % 3])
+    return rows

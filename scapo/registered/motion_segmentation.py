@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which part an observed point belongs to: the one whose motion the other views confirm.
+"""Motion segmentation: an observed point belongs to the part whose motion other views confirm.
 
 A point is carried by each part's motion into other views. Where they have the same surface there,
 that supports the part; where they saw empty space, it speaks against it. Points for which two
@@ -16,8 +16,40 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement
-from scapo.registered.views import Views, free_and_hidden
+from scapo.records import take
+from scapo.registered.template import (
+    ArticulatedTemplate,
+    PartPoses,
+    Placement,
+    spread_out,
+    surface_features,
+)
+from scapo.registered.view_loss import SEEN_WITHIN, match_weight
+from scapo.registered.views import PartialViews
+
+OBSERVERS = 24  # Views, at most, that are asked about the points of the others
+PRIOR = 0.3
+"""Views added to those that agree and to those that do not: where none tells, support is a half."""
+SAME_PLACE = 400.0
+"""Sharpness (of `match_weight`, per squared normalised length) of having the same surface."""
+FACING = 0.3
+"""Cosine above which normals are alike at all, and above which a surface faces the camera."""
+ALIKE = 0.5  # Cosine beyond `FACING` that it takes for normals to be wholly alike
+MISSED = 0.5
+"""How much surface that should be there and is not speaks against a motion; empty space: 1."""
+NEIGHBOUR, FLATNESS = 0.06, 3.0
+"""Of neighbours on a surface: normalised length, and weight of 1 - cosine of their normals."""
+STIFFNESS = 10.0  # How far answers spread, against what each point says itself
+LEAST_COUNT, ALL_COUNT = 40, 6000
+"""Points of a view that the template is built from, at least, and of all views together."""
+BASE_BONUS = 0.1
+"""Log support by which the base wins over a part: what nothing tells apart stays with it."""
+SUPPORTED = 0.4  # Share of the views that must agree for a point to enter the template
+SEEN = 0.05  # Share of the observers that must have seen it, or more than one view
+LEAST_GOOD = 50  # Points without which the template stays as it was
+AVERAGED = 0.03
+"""Reach (normalised length) of the mean that makes a template point of those about it."""
+SURENESS = 6.0  # Logit of a part per unit of log support
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +67,7 @@ class Evidence:
 
 @torch.no_grad()
 def gather_evidence(
-    views: Views,
+    views: PartialViews,
     poses: PartPoses,
     log_scale: Float[Tensor, "B 3"],
     *,
@@ -54,11 +86,11 @@ def gather_evidence(
         for o in observers.tolist():
             there = points.flatten(0, 1) * scale[o] @ turn[o].T + move[o]
             yes, no = _witness(
-                views.take(observers.new_tensor([o])), there, normals.flatten(0, 1) @ turn[o].T
+                take(views, observers.new_tensor([o])), there, normals.flatten(0, 1) @ turn[o].T
             )
             agree = agree + yes * (own != o)
             against = against + no * (own != o)
-        log_support = ((agree + 0.3) / (agree + against + 0.6)).log()
+        log_support = ((agree + PRIOR) / (agree + against + 2 * PRIOR)).log()
         shape = points.shape[:2]
         columns.append(
             (points, normals, log_support.unflatten(0, shape), agree.unflatten(0, shape))
@@ -68,23 +100,23 @@ def gather_evidence(
 
 
 def _witness(
-    view: Views, points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"]
+    view: PartialViews, points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"]
 ) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
     """How far one view confirms oriented points, and how far it contradicts them, in [0, 1]."""
     target, target_normals = view.points[0], view.normals[0]
     off, index = (target.square().sum(-1) - 2 * points @ target.T).min(-1)
     off = (off + points.square().sum(-1)).clamp_min(0)
-    same = (((normals * target_normals[index]).sum(-1) - 0.3) / 0.5).clamp(0, 1)
-    yes = torch.exp(-400.0 * off) * same
-    free, hidden = (mask[0] for mask in free_and_hidden(view, points[None], 0.03))
-    faces = (normals * F.normalize(view.camera - points, dim=-1)).sum(-1) > 0.3
+    same = (((normals * target_normals[index]).sum(-1) - FACING) / ALIKE).clamp(0, 1)
+    yes = match_weight(off, SAME_PLACE) * same
+    free, hidden = (mask[0] for mask in view.free_and_hidden(points[None], SEEN_WITHIN))
+    faces = (normals * F.normalize(view.camera - points, dim=-1)).sum(-1) > FACING
     missed = (~hidden & ~free & faces).to(yes)
-    return yes, (1 - yes) * (free.to(yes) + 0.5 * missed)
+    return yes, (1 - yes) * (free.to(yes) + MISSED * missed)
 
 
 @torch.no_grad()
-def spread(
-    views: Views, values: Float[Tensor, "B K C"], stiffness: float = 10.0
+def smooth(
+    views: PartialViews, values: Float[Tensor, "B K C"], stiffness: float = STIFFNESS
 ) -> Float[Tensor, "B K C"]:
     """Values smoothed over each view's surface: (I + stiffness L)^-1 values, L its Laplacian.
 
@@ -94,7 +126,7 @@ def spread(
     count = values.shape[1]
     points, normals = views.points[:, :count], views.normals[:, :count]
     off = torch.cdist(points, points).square()
-    near = torch.exp(-off / (2 * 0.06**2) - 3 * (1 - normals @ normals.mT))
+    near = torch.exp(-off / (2 * NEIGHBOUR**2) - FLATNESS * (1 - normals @ normals.mT))
     near = near / near.sum(-1).mean(-1)[:, None, None]
     laplacian = torch.diag_embed(near.sum(-1)) - near
     eye = torch.eye(count).to(values)
@@ -104,12 +136,11 @@ def spread(
 @torch.no_grad()
 def rebuild(
     template: ArticulatedTemplate,
-    views: Views,
+    views: PartialViews,
     placement: Placement,
     *,
     poses: PartPoses | None = None,
     generator: torch.Generator,
-    observers: int = 24,
 ) -> None:
     """Build the template's points and part weights anew from all views at their placements.
 
@@ -118,28 +149,27 @@ def rebuild(
         views: B views.
         placement: Theirs.
         poses: Of the parts, if they are not as placed.
-        generator: Draws the observers.
-        observers: Views that are asked about the points of the others.
+        generator: Draws the `OBSERVERS`.
     """
-    count = max(40, min(views.points.shape[1], 6000 // len(views.points)))
+    count = max(LEAST_COUNT, min(views.points.shape[1], ALL_COUNT // len(views.points)))
     order = torch.randperm(len(views.points), generator=generator, device=generator.device)
     evidence = gather_evidence(
         views,
         template.part_poses(placement) if poses is None else poses,
         placement.log_scale,
         count=count,
-        observers=order[:observers],
+        observers=order[:OBSERVERS],
     )
     score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
-    score[..., 0] += 0.1  # what nothing tells apart stays with the base
-    score = spread(views, score)
+    score[..., 0] += BASE_BONUS
+    score = smooth(views, score)
     part = score.argmax(-1)
     chosen = part[..., None, None].expand(*part.shape, 1, 3)
     points = evidence.points.gather(2, chosen)[:, :, 0].flatten(0, 1)
     normals = evidence.normals.gather(2, chosen)[:, :, 0].flatten(0, 1)
     support = evidence.log_support.gather(2, part[..., None])[..., 0].flatten().exp()
     seen = evidence.seen.gather(2, part[..., None])[..., 0].flatten()
-    good = (support > 0.4) & (seen > max(1.0, 0.05 * min(observers, len(order))))
+    good = (support > SUPPORTED) & (seen > max(1.0, SEEN * min(OBSERVERS, len(order))))
     _resample(template, points, normals, score.flatten(0, 1), support, good)
 
 
@@ -152,31 +182,14 @@ def _resample(
     good: Bool[Tensor, " C"],
 ) -> None:
     """Spread-out points among the good ones, each averaged with those about it."""
-    if int(good.sum()) < 50:
+    if int(good.sum()) < LEAST_GOOD:
         return
     points, normals, score, support = points[good], normals[good], score[good], support[good]
     part = F.one_hot(score.argmax(-1), score.shape[1]).to(points)
     feature = surface_features(points, normals, part)
-    index = farthest_features(feature, min(len(template.points), len(points)))
+    index = spread_out(feature, min(len(template.points), len(points)))
     off = torch.cdist(feature[index], feature).square()
-    weight = torch.exp(-off / (2 * 0.03**2)) * support
+    weight = torch.exp(-off / (2 * AVERAGED**2)) * support
     weight = weight / weight.sum(-1, keepdim=True)
-    logit = 6 * weight @ score
+    logit = SURENESS * weight @ score
     template.assign(weight @ points, F.normalize(weight @ normals, dim=-1), logit)
-
-
-def surface_features(
-    points: Float[Tensor, "C 3"], normals: Float[Tensor, "C 3"], part: Float[Tensor, "C P"]
-) -> Float[Tensor, "C D"]:
-    """Features whose distance tells points apart by place, normal (0.06) and part (0.1)."""
-    return torch.cat([points, 0.06 * normals, 0.1 * part], -1)
-
-
-def farthest_features(feature: Float[Tensor, "C D"], count: int) -> Int[Tensor, " {count}"]:
-    """Farthest-point sampling in a feature space."""
-    distance = torch.full_like(feature[:, 0], torch.inf)
-    index = [0]
-    for _ in range(count - 1):
-        distance = torch.minimum(distance, (feature - feature[index[-1]]).square().sum(-1))
-        index.append(int(distance.argmax()))
-    return torch.tensor(index, device=feature.device)

@@ -17,13 +17,22 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from scapo.geometry.points import k_nearest
+from scapo.geometry.points import MEAN_RADIUS, gather, k_nearest
 from scapo.geometry.rigid import project_rotation
 
 SIGNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 """Flips of the principal axes that keep the frame right-handed."""
-CAMERA_UNIT = 4.0
-"""Camera positions are learned in this many normalised units."""
+CAMERA_UNIT = 4.0  # Camera positions are learned in this many normalised units
+WIDTH, NEIGHBOURS = 48, 12
+"""Channels of the narrowest layer, and nearest points that the first one sees."""
+POINT_SCALE, STEP_SCALE = 1 / MEAN_RADIUS, 8.0
+"""By which coordinates, and offsets to neighbours, are brought to about 1."""
+TINY, TINY_TRUST = 1e-9, 1e-6  # Least divisors: sums of weights of points, and of clouds
+GOOD = 0.06
+"""Normalised length within which a vote is good; sureness learns exp(-off^2 / (2 GOOD^2))."""
+SMOOTH = 1e-6  # Squared normalised length within which the distance of votes is smooth
+WEIGHTS = {"votes": 1.0, "sureness": 0.05, "part": 0.03, "state": 0.1, "size": 0.05, "camera": 0.2}
+"""Of the terms of the loss: the votes make the pose, the others should not outweigh them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,26 +55,26 @@ class Votes:
 class PointVotes(nn.Module):
     """Edge features of neighbours, a point network with a global code, heads for the votes."""
 
-    def __init__(self, parts: int, joints: int, *, width: int = 48, neighbours: int = 12) -> None:
+    def __init__(self, parts: int, joints: int, *, width: int = WIDTH) -> None:
         super().__init__()
-        self.joints, self.neighbours = joints, neighbours
+        self.joints = joints
         w = width
-        self.edge = nn.Sequential(nn.Linear(9, w), nn.ReLU(), nn.Linear(w, w))
+        self.edge = nn.Sequential(nn.Linear(3 * 3, w), nn.ReLU(), nn.Linear(w, w))
         self.local = _block(w + 3, 2 * w)
         self.wide = _block(2 * w, 4 * w)
-        self.code = _block(8 * w, 4 * w)
+        self.code = _block(2 * 4 * w, 4 * w)  # greatest and mean of all points
         self.mix = nn.Sequential(_block(w + 2 * w + 4 * w, 4 * w), _block(4 * w, 3 * w))
         self.vote = nn.Linear(3 * w, 3 + 1 + parts)
         self.whole = nn.Sequential(_block(4 * w, 2 * w), nn.Linear(2 * w, joints * 4 + 6))
 
     def forward(self, points: Float[Tensor, "B K 3"]) -> Votes:
         """Votes for clouds of mean radius 0.25 in their principal frames."""
-        index = k_nearest(points, points, self.neighbours)
-        near = points.gather(1, index.flatten(1)[..., None].expand(-1, -1, 3))
-        step = 8 * (near.unflatten(1, index.shape[1:]) - points[:, :, None])
-        here = (4 * points)[:, :, None].expand_as(step)
+        index = k_nearest(points, points, NEIGHBOURS)
+        near = gather(points, index.flatten(1)).unflatten(1, index.shape[1:])
+        step = STEP_SCALE * (near - points[:, :, None])
+        here = (POINT_SCALE * points)[:, :, None].expand_as(step)
         edge = self.edge(torch.cat([step, here, step.square()], -1)).amax(2)  # (B, K, w)
-        local = self.local(torch.cat([edge, 4 * points], -1))  # (B, K, 2w)
+        local = self.local(torch.cat([edge, POINT_SCALE * points], -1))  # (B, K, 2w)
         wide = self.wide(local)
         code = self.code(torch.cat([wide.amax(1), wide.mean(1)], -1))  # (B, 4w)
         spread = code[:, None].expand(-1, points.shape[1], -1)
@@ -100,7 +109,7 @@ def procrustes(
     target: Float[Tensor, "B K 3"], source: Float[Tensor, "B K 3"], weight: Float[Tensor, "B K"]
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
     """Rotation R and translation t with target = R source + t, weighted least squares."""
-    weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-9))[..., None]
+    weight = (weight / weight.sum(-1, keepdim=True).clamp_min(TINY))[..., None]
     target_mean = (weight * target).sum(1)
     source_mean = (weight * source).sum(1)
     cross = ((target - target_mean[:, None]) * weight).mT @ (source - source_mean[:, None])
@@ -126,8 +135,8 @@ class Target:
 def vote_losses(votes: Votes, target: Target) -> dict[str, Tensor]:
     """Distance of the votes (not squared: some targets are wrong), sureness, parts and the rest."""
     off = (votes.points - target.points).square().sum(-1)
-    trust = target.trust / target.trust.sum().clamp_min(1e-6)
-    good = torch.exp(-off.detach() / (2 * 0.06**2))
+    trust = target.trust / target.trust.sum().clamp_min(TINY_TRUST)
+    good = torch.exp(-off.detach() / (2 * GOOD**2))
     sure = F.binary_cross_entropy_with_logits(votes.sureness, good, reduction="none").mean(1)
     part = -(target.part * votes.part.log_softmax(-1)).sum(-1).mean(1)
     state = (votes.state - target.state).abs().mean(1)
@@ -135,11 +144,11 @@ def vote_losses(votes: Votes, target: Target) -> dict[str, Tensor]:
     size = size + (votes.shift - target.shift).abs().mean((1, 2))
     camera = (votes.camera - target.camera).abs().mean(1) / CAMERA_UNIT
     terms = {
-        "votes": (off + 1e-6).sqrt().mean(1),
-        "sureness": 0.05 * sure,
-        "part": 0.03 * part,
-        "state": 0.1 * state,
-        "size": 0.05 * size,
-        "camera": 0.2 * camera,
+        "votes": (off + SMOOTH).sqrt().mean(1),
+        "sureness": sure,
+        "part": part,
+        "state": state,
+        "size": size,
+        "camera": camera,
     }
-    return {name: (trust * value).sum() for name, value in terms.items()}
+    return {name: (trust * (WEIGHTS[name] * value)).sum() for name, value in terms.items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Points that do not belong to the object: what an imperfect mask lets in.
+"""Outliers: points that do not belong to the object, which an imperfect mask let in.
 
 A mask that is a little too wide takes points of the wall behind or the table below. They are few
 and lie apart, so clusters that hold a small share of the points are left out. Repeated points, with
@@ -14,24 +14,23 @@ from torch import Tensor
 
 from scapo.geometry.points import nearest
 
-REACH = 3.5
-"""Points nearer than this many typical spacings belong together."""
-LEAST = 0.03
-"""Share of the points that a cluster must hold."""
+SPACING = 7  # The distance to the nearest but so many, itself the first, is a point's spacing
+REACH = 3.5  # Points nearer than this many typical spacings belong together
+LEAST = 0.03  # Share of the points that a cluster must hold
 MOST = 2048
 """Points whose distances are taken to one another; of a larger cloud the rest go by the nearest."""
 
 
 @torch.no_grad()
-def belongs(points: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
+def inlier_mask(points: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
     """Which points belong to the object: those of every cluster that is not small.
 
     The largest cluster always does.
     """
-    return torch.stack([_belongs(cloud) for cloud in points])
+    return torch.stack([_inliers(cloud) for cloud in points])
 
 
-def _belongs(cloud: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+def _inliers(cloud: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
     distinct, which = torch.unique(cloud, dim=0, return_inverse=True)
     total = len(distinct)
     if total > MOST:
@@ -46,7 +45,7 @@ def _belongs(cloud: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
 def _clusters(points: Float[Tensor, "M 3"]) -> Int[Tensor, " M"]:
     """The smallest index of all points that are connected to each by short steps."""
     gap = torch.cdist(points, points)
-    spacing = gap.kthvalue(min(7, len(points)), dim=1).values.median()
+    spacing = gap.kthvalue(min(SPACING, len(points)), dim=1).values.median()
     apart = (gap > REACH * spacing).fill_diagonal_(False)
     label = torch.arange(len(points), device=points.device)
     while True:
@@ -57,14 +56,12 @@ def _clusters(points: Float[Tensor, "M 3"]) -> Int[Tensor, " M"]:
         label = around
 
 
-def replaced(
-    points: Float[Tensor, "B N 3"], belonging: Bool[Tensor, "B N"]
-) -> Float[Tensor, "B N 3"]:
-    """The clouds with every stray replaced by a point that belongs, so that N stays."""
-    order = belonging.int().argsort(dim=1, descending=True, stable=True)
-    count = belonging.sum(1, keepdim=True)
+def replaced(points: Float[Tensor, "B N 3"], inlier: Bool[Tensor, "B N"]) -> Float[Tensor, "B N 3"]:
+    """The clouds with every outlier replaced by an inlier, so that N stays."""
+    order = inlier.int().argsort(dim=1, descending=True, stable=True)
+    count = inlier.sum(1, keepdim=True)
     place = torch.arange(points.shape[1], device=points.device).expand_as(order)
-    source = order.gather(1, place % count)  # strays come last, and repeat the first ones
+    source = order.gather(1, place % count)  # outliers come last, and repeat the first ones
     return torch.empty_like(points).scatter(
         1, order[..., None].expand_as(points), points.gather(1, source[..., None].expand_as(points))
     )

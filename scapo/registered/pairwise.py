@@ -4,8 +4,8 @@
 The score of a hypothesis asks of every point of either view: is there surface of the other view
 here, with the same normal (cost near 0); would it be hidden there (no evidence, a fixed middle
 cost); or does it stand in space that the other camera saw empty (cost 1)? The best hypotheses are
-refined by weighted point-to-plane steps. The margin between the best and the second, different
-rotation tells how much a registration may be trusted.
+refined by weighted point-to-plane steps (ICP). The margin between the best and the second,
+different rotation tells how much a registration may be trusted.
 """
 
 from __future__ import annotations
@@ -13,21 +13,47 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import roma
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.geometry.points import gather
-from scapo.registered.views import Views, free_and_hidden
+from scapo.geometry.rotations import rotvec_to_rotmat, unitquat_to_rotmat
+from scapo.records import cat, take
+from scapo.registered.gauss_newton import by_turn, damped_step
+from scapo.registered.view_loss import match_weight, sharpened
+from scapo.registered.views import TINY, PartialViews
 
-NORMAL_WEIGHT = 1.5
-"""Of 1 - cosine of the normals beside sharpness times squared distance."""
-HIDDEN_COST = 0.55
-"""Largest cost of a point about which the other view says nothing."""
-EXTENT = 0.8
-"""Half the side of the cube of nearest points; a cloud reaches about 0.6."""
+HIDDEN_COST = 0.55  # Largest cost of a point about which the other view says nothing
+HIDDEN_BEHIND = 0.05  # Normalised length behind what a camera saw at which a point is hidden
+EXTENT = 0.8  # Half the side of the cube of nearest points; a cloud reaches about 0.6
 CELLS = 28
+"""Of that cube along either side: 0.057 each, half of which is what a look-up may be wrong by."""
+BLOCK = 4096  # Cells whose nearest points are sought at once: a few MB
+SPIRAL = 1.533751168755204288118041
+"""The second winding number of the super-Fibonacci spiral, the positive root of x^4 = x + 4."""
+SLIDES = (20.0, 60.0)
+"""Sharpness (of `match_weight`, per squared normalised length) as a view slides to its matches."""
+SCORED = 140.0  # Sharpness of the score
+ICP = (60.0, 400.0)  # Sharpness of the first and the last step of refinement
+ICP_STEPS, ICP_POINTS = 8, 96  # Of refinement, and points of the moved view in it
+SAME_SIDE = 0.62
+"""Share of the grid that is tried: rotations under which both cameras look from one side."""
+COARSE, FINE, FINAL = 28, 96, 192
+"""Points of a view for a first score of all rotations, a second of those left, and the last."""
+SLID = 48  # Points of a view, at most, that slide to their matches
+LEFT = 96  # Rotations of a pair that are scored a second time
+KEPT = 4  # Modes of a pair
+SPARE = 2  # Hypotheses refined beyond those, as some will come to the same pose
+APART = 28.0  # Degrees between hypotheses that are refined: a little more than the grid's spacing
+DISTINCT = 20.0  # Degrees within which refined hypotheses are the same mode
+CLEAR = 0.1  # Margin of a pair that has one mode only: one that other pairs reach too
+ALONG = 0.1  # Weight of distances along the surface beside those across it
+DAMPING = 1e-4  # Share of the system's mean diagonal that is added to it
+NONE = 1e-8  # And beyond that, for pairs without a match
+CHUNK = 8  # Pairs registered at once, each with all rotations: a matter of memory
+REPEATED, CHOSEN = 10.0, 100.0
+"""Added to a score, of at most 1, where it is near one that was chosen, and where it was itself."""
 
 
 def rotation_grid(count: int) -> Float[Tensor, "{count} 3 3"]:
@@ -35,14 +61,14 @@ def rotation_grid(count: int) -> Float[Tensor, "{count} 3 3"]:
     i = torch.arange(count, dtype=torch.float64) + 0.5
     radius, other = (i / count).sqrt(), (1 - i / count).sqrt()
     alpha = 2 * math.pi * i / math.sqrt(2)
-    beta = 2 * math.pi * i / 1.533751168755204288118041
+    beta = 2 * math.pi * i / SPIRAL
     quaternion = [
         radius * alpha.sin(),
         radius * alpha.cos(),
         other * beta.sin(),
         other * beta.cos(),
     ]
-    return roma.unitquat_to_rotmat(torch.stack(quaternion, -1)).float()
+    return unitquat_to_rotmat(torch.stack(quaternion, -1)).float()
 
 
 def within(cosine_trace: Float[Tensor, "*B"], degrees: float) -> Tensor:
@@ -67,7 +93,7 @@ class NearestGrid:
         rows = []
         for p, n in zip(points, normals, strict=True):
             index = torch.cat(
-                [(p.square().sum(-1) - 2 * part @ p.mT).argmin(-1) for part in cells.split(4096)]
+                [(p.square().sum(-1) - 2 * part @ p.mT).argmin(-1) for part in cells.split(BLOCK)]
             )
             rows.append(torch.cat([p[index], n[index]], -1))
         return NearestGrid(table=torch.cat(rows))
@@ -82,6 +108,35 @@ class NearestGrid:
         found = self.table.index_select(0, row.flatten()).unflatten(0, row.shape)
         return found[..., :3], found[..., 3:]
 
+    def match(
+        self,
+        index: Int[Tensor, " Q"],
+        points: Float[Tensor, "Q H K 3"],
+        normals: Float[Tensor, "Q H K 3"],
+        sharpness: float,
+    ) -> tuple[Float[Tensor, "Q H K 3"], Float[Tensor, "Q H K"]]:
+        """From each oriented point to its nearest one of set `index`: the gap, `match_weight`."""
+        near, near_normal = (
+            x.unflatten(1, points.shape[1:3]) for x in self.lookup(index, points.flatten(1, 2))
+        )
+        gap = near - points
+        cosine = (normals * near_normal).sum(-1)
+        return gap, match_weight(gap.square().sum(-1), sharpness, cosine)
+
+    def slide(
+        self,
+        index: Int[Tensor, " Q"],
+        points: Float[Tensor, "#Q H K 3"],
+        normals: Float[Tensor, "Q H K 3"],
+        move: Float[Tensor, "Q H 3"],
+    ) -> Float[Tensor, "Q H 3"]:
+        """The translation from `move` on to where the points lie on their matches on average."""
+        for sharpness in SLIDES:
+            gap, weight = self.match(index, points + move[:, :, None], normals, sharpness)
+            total = weight.sum(-1, keepdim=True).clamp_min(TINY)
+            move = move + (weight[..., None] * gap).sum(-2) / total
+        return move
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Modes:
@@ -94,26 +149,21 @@ class Modes:
 
 
 def one_way_cost(
-    views: Views,
+    views: PartialViews,
     grid: NearestGrid,
     index: Int[Tensor, " Q"],
-    points: Float[Tensor, "Q H P 3"],
-    normals: Float[Tensor, "Q H P 3"],
+    points: Float[Tensor, "Q H K 3"],
+    normals: Float[Tensor, "Q H K 3"],
 ) -> Float[Tensor, "Q H"]:
     """Mean cost of oriented points placed into views `index` under H hypotheses."""
-    shape = points.shape[:3]
-    flat = points.flatten(1, 2)
-    near, near_normal = grid.lookup(index, flat)
-    cosine = (normals.flatten(1, 2) * near_normal).sum(-1)
-    cost = 1 - torch.exp(-140.0 * (flat - near).square().sum(-1) - NORMAL_WEIGHT * (1 - cosine))
-    _, hidden = free_and_hidden(views.take(index), flat, 0.05)
-    cost = torch.where(hidden, cost.clamp_max(HIDDEN_COST), cost)
-    return cost.unflatten(1, shape[1:]).mean(-1)
+    cost = 1 - grid.match(index, points, normals, SCORED)[1]
+    _, hidden = take(views, index).free_and_hidden(points.flatten(1, 2), HIDDEN_BEHIND)
+    return torch.where(hidden.view_as(cost), cost.clamp_max(HIDDEN_COST), cost).mean(-1)
 
 
 @torch.no_grad()
 def pair_cost(
-    views: Views,
+    views: PartialViews,
     grid: NearestGrid,
     pairs: Int[Tensor, "Q 2"],
     rotation: Float[Tensor, "Q H 3 3"],
@@ -127,36 +177,6 @@ def pair_cost(
     forward = one_way_cost(views, grid, target, there, normals[source] @ rotation.mT)
     back = (points[target] - translation[:, :, None]) @ rotation
     return (forward + one_way_cost(views, grid, source, back, normals[target] @ rotation)) / 2
-
-
-@torch.no_grad()
-def slide(
-    views: Views,
-    grid: NearestGrid,
-    pairs: Int[Tensor, "Q 2"],
-    rotation: Float[Tensor, "Q H 3 3"],
-    count: int,
-) -> Float[Tensor, "Q H 3"]:
-    """The translation of each rotation: from centroid on centroid to the mean of the matches.
-
-    Centroids of two partial views are not the same point of the object, and a wrong translation
-    hides a right rotation.
-    """
-    points = (views.points[:, None, :count])[pairs[:, 0]] @ rotation.mT
-    normals = (views.normals[:, None, :count])[pairs[:, 0]] @ rotation.mT
-    move = rotation.new_zeros(*rotation.shape[:2], 3)
-    for sharpness in (20.0, 60.0):
-        placed = points + move[:, :, None]
-        near, near_normal = (
-            x.unflatten(1, placed.shape[1:3])
-            for x in grid.lookup(pairs[:, 1], placed.flatten(1, 2))
-        )
-        gap = near - placed
-        cosine = (normals * near_normal).sum(-1)
-        weight = torch.exp(-sharpness * gap.square().sum(-1) - NORMAL_WEIGHT * (1 - cosine))
-        total = weight.sum(-1, keepdim=True).clamp_min(1e-6)
-        move = move + (weight[..., None] * gap).sum(-2) / total
-    return move
 
 
 @torch.no_grad()
@@ -174,8 +194,8 @@ def distinct(
         best = score.argmin(-1)
         chosen.append(best)
         trace = (rotation * rotation[rows, best][:, None]).sum((-1, -2))
-        score = torch.where(within(trace, degrees), score + 10, score)
-        score[rows, best] += 100
+        score = torch.where(within(trace, degrees), score + REPEATED, score)
+        score[rows, best] += CHOSEN
     return torch.stack(chosen, -1)
 
 
@@ -184,52 +204,45 @@ def plane_step(
     target: Float[Tensor, "B P 3"],
     normal: Float[Tensor, "B P 3"],
     weight: Float[Tensor, "B P"],
-    slide: float = 0.1,
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
-    """One Gauss-Newton step of point-to-plane plus `slide` times point-to-point distances.
+    """One Gauss-Newton step of point-to-plane plus `ALONG` times point-to-point distances.
 
     Returns:
         Rotation and translation to apply after the present pose, x -> R x + t.
     """
     residual = moved - target
-    jacobian = torch.cat([torch.linalg.cross(moved, normal), normal], -1)
-    weighted = jacobian * weight[..., None]
-    system = weighted.mT @ jacobian
-    right = (weighted * (residual * normal).sum(-1, keepdim=True)).sum(-2)
+    across = torch.cat([torch.linalg.cross(moved, normal), normal], -1)
+    weighted = across * weight[..., None]
+    system = weighted.mT @ across
+    gradient = (weighted * (residual * normal).sum(-1, keepdim=True)).sum(-2)
     eye = torch.eye(3).to(moved).expand(*moved.shape[:-1], 3, 3)
-    skew = torch.linalg.cross(moved[..., None, :].expand_as(eye), eye)
-    full = torch.cat([skew, eye], -1).flatten(-3, -2)  # (B, 3P, 6): d residual / d twist
-    spread = weight.repeat_interleave(3, -1)[..., None] * slide * full
+    full = torch.cat([by_turn(moved).mT, eye], -1).flatten(-3, -2)  # (B, 3P, 6)
+    spread = weight.repeat_interleave(3, -1)[..., None] * ALONG * full
     system = system + spread.mT @ full
-    right = right + (spread * residual.flatten(-2)[..., None]).sum(-2)
-    damping = 1e-4 * system.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-8
-    system = system + damping[..., None, None] * torch.eye(6).to(moved)
-    twist = -torch.linalg.solve(system, right)
-    return roma.rotvec_to_rotmat(twist[..., :3]), twist[..., 3:]
+    gradient = gradient + (spread * residual.flatten(-2)[..., None]).sum(-2)
+    damping = DAMPING * system.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True) + NONE
+    twist = damped_step(system, gradient, damping)
+    return rotvec_to_rotmat(twist[..., :3]), twist[..., 3:]
 
 
 @torch.no_grad()
 def icp(
-    views: Views,
+    views: PartialViews,
     pairs: Int[Tensor, "Q 2"],
     rotation: Float[Tensor, "Q 3 3"],
     translation: Float[Tensor, "Q 3"],
-    *,
-    steps: int = 8,
-    count: int = 96,
 ) -> tuple[Float[Tensor, "Q 3 3"], Float[Tensor, "Q 3"]]:
     """Weighted point-to-plane refinement of target_T_source, weights sharper each step."""
-    points, normals = views.points[pairs[:, 0], :count], views.normals[pairs[:, 0], :count]
+    points, normals = (x[pairs[:, 0], :ICP_POINTS] for x in (views.points, views.normals))
     target, target_normals = views.points[pairs[:, 1]], views.normals[pairs[:, 1]]
     square = target.square().sum(-1)[:, None]
-    for step in range(steps):
-        sharpness = 60.0 * (400.0 / 60.0) ** (step / max(steps - 1, 1))
+    for sharpness in sharpened(ICP, ICP_STEPS):
         moved = points @ rotation.mT + translation[:, None]
         index = (square - 2 * moved @ target.mT).argmin(-1)
         near, near_normal = gather(target, index), gather(target_normals, index)
         cosine = ((normals @ rotation.mT) * near_normal).sum(-1)
-        weight = (moved - near).square().sum(-1) * -sharpness - NORMAL_WEIGHT * (1 - cosine)
-        turn, shift = plane_step(moved, near, near_normal, weight.exp())
+        weight = match_weight((moved - near).square().sum(-1), sharpness, cosine)
+        turn, shift = plane_step(moved, near, near_normal, weight)
         rotation = turn @ rotation
         translation = (turn @ translation[..., None])[..., 0] + shift
     return rotation, translation
@@ -237,53 +250,69 @@ def icp(
 
 @torch.no_grad()
 def register_pairs(
-    views: Views,
-    pairs: Int[Tensor, "Q 2"],
-    *,
-    rotations: Float[Tensor, "H 3 3"],
-    keep: int = 4,
-    chunk: int = 8,
+    views: PartialViews, pairs: Int[Tensor, "Q 2"], *, rotations: Float[Tensor, "H 3 3"]
 ) -> Modes:
-    """The `keep` best distinct poses of each pair's first view in the frame of its second.
+    """The `KEPT` best distinct poses of each pair's first view in the frame of its second.
 
     Only rotations under which the two cameras look from the same side are tried: surfaces that
     were seen from opposite sides do not overlap.
     """
     grid = NearestGrid.build(views.points, views.normals)
-    found = [_register(views, grid, part, rotations, keep) for part in pairs.split(chunk)]
-    rotation, translation, score = (torch.cat(rows) for rows in zip(*found, strict=True))
-    return Modes(rotation=rotation, translation=translation, score=score)
+    return cat([_register(views, grid, part, rotations) for part in pairs.split(CHUNK)])
 
 
 def _register(
-    views: Views,
+    views: PartialViews,
     grid: NearestGrid,
     pairs: Int[Tensor, "Q 2"],
     rotations: Float[Tensor, "H 3 3"],
-    keep: int,
-) -> tuple[Tensor, Tensor, Tensor]:
-    camera = views.direction()
-    move = views.points.new_zeros(0)
-    score = views.points.new_zeros(0)
-    side = torch.einsum("hab,qb,qa->qh", rotations, camera[pairs[:, 0]], camera[pairs[:, 1]])
-    index = side.topk(round(0.62 * len(rotations)), dim=-1).indices
-    for count, left in ((28, 96), (96, None)):
-        hypotheses = rotations[index]
-        move = slide(views, grid, pairs, hypotheses, min(count, 48))
-        score = pair_cost(views, grid, pairs, hypotheses, move, count)
-        if left is not None:
-            index = index.gather(1, score.topk(left, largest=False).indices)
-    best = distinct(rotations[index], score, keep + 2, 28.0)
-    move = move.gather(1, best[..., None].expand(-1, -1, 3))
-    index = index.gather(1, best)
-    many = pairs.repeat_interleave(keep + 2, 0)
-    rotation, translation = icp(views, many, rotations[index].flatten(0, 1), move.flatten(0, 1))
-    rotation, translation = (x.unflatten(0, index.shape) for x in (rotation, translation))
-    score = pair_cost(views, grid, pairs, rotation, translation, 192)
-    best = distinct(rotation, score, keep, 20.0)
+) -> Modes:
+    rotation, move = _hypotheses(views, grid, pairs, rotations)
+    many = pairs.repeat_interleave(rotation.shape[1], 0)
+    refined = icp(views, many, rotation.flatten(0, 1), move.flatten(0, 1))
+    rotation, translation = (x.unflatten(0, move.shape[:2]) for x in refined)
+    score = pair_cost(views, grid, pairs, rotation, translation, FINAL)
+    best = distinct(rotation, score, KEPT, DISTINCT)
     rows = torch.arange(len(pairs), device=best.device)[:, None]
     rotation, translation, score = rotation[rows, best], translation[rows, best], score[rows, best]
-    return rotation, translation, _unrivalled(rotation, score)
+    return Modes(rotation=rotation, translation=translation, score=_unrivalled(rotation, score))
+
+
+def _hypotheses(
+    views: PartialViews,
+    grid: NearestGrid,
+    pairs: Int[Tensor, "Q 2"],
+    rotations: Float[Tensor, "H 3 3"],
+) -> tuple[Float[Tensor, "Q K 3 3"], Float[Tensor, "Q K 3"]]:
+    """Of each pair the best distinct rotations of the grid and their translations."""
+    camera = views.direction()
+    side = torch.einsum("hab,qb,qa->qh", rotations, camera[pairs[:, 0]], camera[pairs[:, 1]])
+    index = side.topk(round(SAME_SIDE * len(rotations)), dim=-1).indices
+    move = _slide(views, grid, pairs, rotations[index], COARSE)
+    score = pair_cost(views, grid, pairs, rotations[index], move, COARSE)
+    index = index.gather(1, score.topk(LEFT, largest=False).indices)
+    move = _slide(views, grid, pairs, rotations[index], SLID)
+    score = pair_cost(views, grid, pairs, rotations[index], move, FINE)
+    best = distinct(rotations[index], score, KEPT + SPARE, APART)
+    return rotations[index.gather(1, best)], move.gather(1, best[..., None].expand(-1, -1, 3))
+
+
+def _slide(
+    views: PartialViews,
+    grid: NearestGrid,
+    pairs: Int[Tensor, "Q 2"],
+    rotation: Float[Tensor, "Q H 3 3"],
+    count: int,
+) -> Float[Tensor, "Q H 3"]:
+    """The translation of each rotation: from centroid on centroid to the mean of the matches.
+
+    Centroids of two partial views are not the same point of the object, and a wrong translation
+    hides a right rotation.
+    """
+    points = (views.points[:, None, :count])[pairs[:, 0]] @ rotation.mT
+    normals = (views.normals[:, None, :count])[pairs[:, 0]] @ rotation.mT
+    none = rotation.new_zeros(*rotation.shape[:2], 3)
+    return grid.slide(pairs[:, 1], points, normals, none)
 
 
 def _unrivalled(
@@ -295,6 +324,6 @@ def _unrivalled(
     pairs reach too, or a few such pairs would outvote the rest.
     """
     trace = torch.einsum("qkab,qlab->qkl", rotation, rotation)
-    repeats = within(trace, 20.0).tril(-1).any(-1)
-    clear = torch.maximum(score[:, :1] + 0.1, score.amax(1, keepdim=True))
+    repeats = within(trace, DISTINCT).tril(-1).any(-1)
+    clear = torch.maximum(score[:, :1] + CLEAR, score.amax(1, keepdim=True))
     return torch.where(repeats, clear, score)

@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""The placements that search found for the training clouds, as the network's targets."""
+"""Pseudo-labels: placements that search found for the training clouds, the network's targets."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.registered.template import Placement
 
 
-class PseudoPlacements(nn.Module):
-    """Placements of training clouds as found, looked up by a cloud's first point."""
+class PseudoLabels(nn.Module):
+    """Placements of training clouds as found, in the order of those clouds."""
 
     key: Tensor
+    """Each cloud's first point."""
     rotation: Tensor
     translation: Tensor
     log_scale: Tensor
@@ -26,17 +26,9 @@ class PseudoPlacements(nn.Module):
     trust: Tensor
     """Weight of each when the network learns."""
     belonging: Tensor
-    """Which points of each cloud belong to the object (bool)."""
-    NAMES: ClassVar[tuple[str, ...]] = (
-        "key",
-        "rotation",
-        "translation",
-        "log_scale",
-        "state",
-        "shift",
-        "camera",
-        "trust",
-    )
+    """Which points of each cloud are inliers (bool)."""
+    PLACEMENT: ClassVar = ("rotation", "translation", "log_scale", "state", "shift")
+    NAMES: ClassVar = ("key", *PLACEMENT, "camera", "trust")
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,35 +38,14 @@ class PseudoPlacements(nn.Module):
 
     def set(self, key: Tensor, placement: Placement, camera: Tensor, trust: Tensor) -> None:
         """Replace all."""
-        values = (
-            key,
-            placement.rotation,
-            placement.translation,
-            placement.log_scale,
-            placement.state,
-            placement.shift,
-            camera,
-            trust,
-        )
+        values = (key, *(getattr(placement, name) for name in self.PLACEMENT), camera, trust)
         for name, value in zip(self.NAMES, values, strict=True):
             setattr(self, name, value.detach().clone())
 
     def placement(self) -> Placement:
-        """All of them, their hinges straight."""
-        names = self.NAMES[1:6]
-        values = {name: getattr(self, name) for name in names}
-        return Placement(**values, lean=torch.zeros_like(self.shift))
-
-    def find(self, first: Float[Tensor, "B 3"]) -> Int[Tensor, " B"]:
-        """Row of each cloud, by its first point.
-
-        Raises:
-            ValueError: A cloud that is not there.
-        """
-        gap = (first[:, None] - self.key).abs().sum(-1)
-        if bool((gap.amin(1) > 0).any()):
-            raise ValueError("expected clouds whose placements were found, found others")
-        return gap.argmin(1)
+        """All of them, about the category's axes."""
+        values = {name: getattr(self, name) for name in self.PLACEMENT}
+        return Placement(**values, deviation=torch.zeros_like(self.shift))
 
     def _load_from_state_dict(
         self,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The shape that registration and joint fit share: an articulated template and its placements.
+"""The shape that all steps share: an articulated template and its placements.
 
 One template per category: oriented points, part weights, joint axes and pivots, all in a template
 frame at state 0. A placement says where one cloud has it: pose of the base, joint states, three
@@ -8,16 +8,26 @@ scales along the template's axes, and for prismatic joints where on the body the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-import roma
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from scapo.types import JointKind
+from scapo.categories import JointKind
+from scapo.geometry.points import farthest_points
+from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.records import cat, take
+
+SPAN = (0.02, 0.98)
+"""Quantiles of coordinates that count as the ends of a shape: single points lie beyond it."""
+NORMAL_LENGTH = 0.06
+"""Normalised length that a unit of normal difference counts as when points are told apart; the
+normals of a plate's two faces differ by 2."""
+PART_LENGTH = 0.1
+"""That of a unit of part weights, so that small parts are sampled along their borders too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,16 +43,8 @@ class Placement:
     """Relative to the template's own state: rad or normalised length."""
     shift: Float[Tensor, "B J 3"]
     """Of a joint and its part on the base, template frame, after scaling."""
-    lean: Float[Tensor, "B J 3"]
-    """Turn of a hinge's axis from the category's (rotation vector, template frame)."""
-
-    def take(self, index: Int[Tensor, " Q"]) -> Placement:
-        """The placements of these indices."""
-        return Placement(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
-
-    def detach(self) -> Placement:
-        """The same values without a graph."""
-        return Placement(**{f.name: getattr(self, f.name).detach() for f in fields(self)})
+    deviation: Float[Tensor, "B J 3"]
+    """Of a hinge's axis from the category's (rotation vector, template frame)."""
 
     @staticmethod
     def at(
@@ -57,14 +59,8 @@ class Placement:
             log_scale=torch.zeros_like(translation),
             state=state,
             shift=translation.new_zeros(*state.shape, 3),
-            lean=translation.new_zeros(*state.shape, 3),
+            deviation=translation.new_zeros(*state.shape, 3),
         )
-
-    @staticmethod
-    def cat(parts: list[Placement]) -> Placement:
-        """Placements one after the other."""
-        names = [f.name for f in fields(Placement)]
-        return Placement(**{n: torch.cat([getattr(p, n) for p in parts]) for n in names})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,10 +69,6 @@ class PartPoses:
 
     rotation: Float[Tensor, "B P 3 3"]
     translation: Float[Tensor, "B P 3"]
-
-    def take(self, index: Int[Tensor, " Q"]) -> PartPoses:
-        """The poses of these views."""
-        return PartPoses(rotation=self.rotation[index], translation=self.translation[index])
 
 
 class ArticulatedTemplate(nn.Module):
@@ -93,11 +85,11 @@ class ArticulatedTemplate(nn.Module):
     normals: Tensor
     """(M, 3); a buffer, as what follows."""
     rest: Tensor
-    """(J,) state at which a lean leaves the part where it is; see `leans`."""
+    """(J,) state at which a deviating axis leaves the part where it is; see `axis_deviation`."""
     load: Tensor
-    """(2 J,) what hinges lean by, along the two directions across each axis; 0: they do not."""
+    """(2 J,) what axes deviate by, along the two directions across each; 0: they do not."""
     noise: Tensor
-    """(2 J, 2 J) covariance of tilts that no lean explains."""
+    """(2 J, 2 J) covariance of observed part rotations that no deviation explains."""
 
     def __init__(self, kinds: tuple[JointKind, ...], count: int = 400) -> None:
         """A template of `count` points at the origin, to be filled by `assign`."""
@@ -119,7 +111,7 @@ class ArticulatedTemplate(nn.Module):
         *rest: Any,  # noqa: ANN401 - as torch calls it
         **named: Any,  # noqa: ANN401
     ) -> None:
-        """Hinges of a template that was saved without leans are straight."""
+        """Axes of a template that was saved without deviations are the category's."""
         for name in ("rest", "load", "noise"):
             state_dict.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state_dict, prefix, *rest, **named)
@@ -141,8 +133,8 @@ class ArticulatedTemplate(nn.Module):
     def with_points(self, count: int) -> ArticulatedTemplate:
         """Another with the same joints and so many points.
 
-        They are the first of this one's, which `part_evidence.rebuild` leaves spread out; where
-        there are fewer, all of them, repeated.
+        They are the first of this one's, which `motion_segmentation.rebuild` leaves spread out;
+        where there are fewer, all of them, repeated.
         """
         made = ArticulatedTemplate(self.kinds, count).to(self.points)
         made.assign(self.points[:count], self.normals[:count], self.logit[:count])
@@ -154,23 +146,23 @@ class ArticulatedTemplate(nn.Module):
         """Unit axes."""
         return F.normalize(self.axis, dim=-1)
 
-    def leans(self) -> bool:
-        """Whether hinges of this category lean."""
+    def deviates(self) -> bool:
+        """Whether hinges of this category have axes that differ from object to object."""
         return bool(self.load.any())
 
-    def leaning(self, placement: Placement) -> Float[Tensor, "B J 3"]:
-        """Unit axes of each view's own hinges, template frame."""
-        turn = roma.rotvec_to_rotmat(placement.lean)
+    def own_directions(self, placement: Placement) -> Float[Tensor, "B J 3"]:
+        """Unit axes of each view's own object, template frame."""
+        turn = rotvec_to_rotmat(placement.deviation)
         return (turn @ self.directions()[:, :, None])[..., 0]
 
     def _hinged(self, j: int, placement: Placement) -> Float[Tensor, "B 3 3"]:
-        """How hinge j turns its part: from its rest about the axis that leans (`leans`)."""
+        """How hinge j turns its part: from its rest about its own axis (`axis_deviation`)."""
         axis, state = self.directions()[j], placement.state[:, j : j + 1]
-        if not bool(placement.lean[:, j].any()):
-            return roma.rotvec_to_rotmat(axis * state)
-        lean = roma.rotvec_to_rotmat(placement.lean[:, j])
-        onward = roma.rotvec_to_rotmat(axis * (state - self.rest[j]))
-        return lean @ onward @ lean.mT @ roma.rotvec_to_rotmat(axis * self.rest[j])
+        if not bool(placement.deviation[:, j].any()):
+            return rotvec_to_rotmat(axis * state)
+        aside = rotvec_to_rotmat(placement.deviation[:, j])
+        onward = rotvec_to_rotmat(axis * (state - self.rest[j]))
+        return aside @ onward @ aside.mT @ rotvec_to_rotmat(axis * self.rest[j])
 
     def part_poses(self, placement: Placement) -> PartPoses:
         """view_T_part of every part at the placement's states (corrected bone map of Sec. 3.2)."""
@@ -214,9 +206,9 @@ class ArticulatedTemplate(nn.Module):
 
     @torch.no_grad()
     def part_centres(self) -> Float[Tensor, "P 3"]:
-        """Middle of the box of each part's points (2 to 98 %), unscaled; of all if it has none."""
+        """Middle of the box (`SPAN`) of each part's points, unscaled; of all if it has none."""
         part = self.logit.argmax(-1)
-        ends = torch.tensor([0.02, 0.98]).to(self.points)
+        ends = torch.tensor(SPAN).to(self.points)
         own = [self.points[part == p] for p in range(self.logit.shape[1])]
         filled = [points if len(points) else self.points for points in own]
         return torch.stack([points.quantile(ends, 0).mean(0) for points in filled])
@@ -231,13 +223,38 @@ class ArticulatedTemplate(nn.Module):
         pivot = torch.where(slides(self) > 0, self.part_centres()[1:], self.pivot)
         pivot = pivot * placement.log_scale.exp()[:, None] + placement.shift
         pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
-        return pivot, self.leaning(placement) @ placement.rotation.mT
+        return pivot, self.own_directions(placement) @ placement.rotation.mT
 
 
 def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:
     """1 for each prismatic joint, 0 for the others."""
     sliding = [[float(kind == "prismatic")] for kind in template.kinds]
     return torch.tensor(sliding).to(template.points)
+
+
+def across_axis(axis: Float[Tensor, " 3"]) -> Float[Tensor, "2 3"]:
+    """Two unit directions at right angles to an axis and each other, by the template's frame."""
+    least = F.one_hot(axis.abs().argmin(), 3).to(axis)
+    first = F.normalize(torch.linalg.cross(axis, least), dim=0)
+    return torch.stack([first, torch.linalg.cross(axis, first)])
+
+
+def oriented(points: Float[Tensor, "*B M 3"], normals: Float[Tensor, "*B M 3"]) -> Tensor:
+    """(*B, M, 6) features whose distance tells points apart by place and normal."""
+    return torch.cat([points, NORMAL_LENGTH * normals], -1)
+
+
+def surface_features(
+    points: Float[Tensor, "M 3"], normals: Float[Tensor, "M 3"], part: Float[Tensor, "M P"]
+) -> Float[Tensor, "M D"]:
+    """Features whose distance tells points apart by place, normal and part."""
+    return torch.cat([oriented(points, normals), PART_LENGTH * part], -1)
+
+
+def spread_out(feature: Float[Tensor, "M D"], count: int) -> Int[Tensor, " {count}"]:
+    """Indices of points that are far apart; where there are too few the first one fills up."""
+    index = farthest_points(feature, min(count, len(feature)))
+    return F.pad(index, (0, count - len(index)))
 
 
 def turn_placement(placement: Placement, turn: Float[Tensor, "B 3 3"]) -> Placement:
@@ -257,4 +274,4 @@ def interleave(sources: list[Placement], count: int) -> Placement:
     columns = [
         begin + view * size + torch.arange(size) for begin, size in zip(starts, sizes, strict=True)
     ]
-    return Placement.cat(sources).take(torch.cat(columns, 1).flatten())
+    return take(cat(sources), torch.cat(columns, 1).flatten())

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""What one view says of an object: oriented surface points, and where nothing can be.
+"""What a partial view says of an object: oriented surface points, and where nothing can be.
 
 A cloud seen by a camera carries more than its points: normals face the camera, the rays in front
-of every point are empty, and what lies behind is unknown. `Views` keeps a batch of clouds in this
-form: normalised (mean radius 0.25 about the origin), spread out by farthest-point sampling, with
-normals and a coarse depth image that answers "free, observed or hidden" for any point.
+of every point are empty, and what lies behind is unknown. `PartialViews` keeps a batch of clouds in
+this form: normalised (mean radius 0.25 about the origin), spread out by farthest-point sampling,
+with normals and a coarse depth image that answers "free, observed or hidden" for any point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -19,12 +19,17 @@ from torch import Tensor
 from scapo.geometry.points import farthest_points, gather, k_nearest
 from scapo.geometry.rigid import rotation_between
 
-FAR = 1e3
-"""Depth of a cell that shows background."""
+FAR = 1e3  # Depth of a cell that shows background, in normalised lengths: beyond all that is tried
+CELLS = 24  # Of the depth image along either side: about 0.05 of normalised length each
+MARGIN = 1.001  # Of the depth image about the points, so that rounding leaves none outside
+TINY = 1e-6  # Least divisor, of sides of images and sums of weights that may be 0
+LEAST_DEPTH = 1e-3
+"""Normalised length that depths are divided by at least: no image of points behind the camera."""
+NEIGHBOURS = 16  # Points that tell a normal: fewer follow the noise, more round off the edges
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Views:
+class PartialViews:
     """A batch of clouds, each in its own normalised frame."""
 
     points: Float[Tensor, "B K 3"]
@@ -42,19 +47,41 @@ class Views:
     half: Float[Tensor, " B"]
     """Half the side of the square."""
 
-    def take(self, index: Int[Tensor, " Q"]) -> Views:
-        """The views of these indices."""
-        return Views(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
-
     def direction(self) -> Float[Tensor, "B 3"]:
         """Unit vector from the origin to the camera."""
         return F.normalize(self.camera, dim=-1)
+
+    def thinned(self, index: Int[Tensor, " K"]) -> PartialViews:
+        """With these points only, of every view the same ones."""
+        return replace(self, points=self.points[:, index], normals=self.normals[:, index])
+
+    @torch.no_grad()
+    def free_and_hidden(
+        self, points: Float[Tensor, "B M 3"], tolerance: float
+    ) -> tuple[Bool[Tensor, "B M"], Bool[Tensor, "B M"]]:
+        """Whether each point would be seen in empty space, and whether something hides it.
+
+        Neither: it lies within `tolerance` of what the camera saw there. Points on the background
+        are free: the object would have been seen.
+
+        Args:
+            points: In the frame of each view.
+            tolerance: Normalised length along the ray.
+        """
+        seen = (points - self.camera[:, None]) @ self.look.mT
+        z = seen[..., 2]
+        cells = self.depth.shape[-1] - 2
+        image = seen[..., :2] / z.clamp_min(LEAST_DEPTH)[..., None]
+        cell = (image - self.centre[:, None]) / self.half[:, None, None] * 0.5 + 0.5
+        cell = (cell * cells + 1).floor().long().clamp(0, cells + 1)
+        depth = self.depth.flatten(1).gather(1, cell[..., 1] * (cells + 2) + cell[..., 0])
+        return z < depth - tolerance, z > depth + tolerance
 
 
 @torch.no_grad()
 def observe(
     points: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"], *, count: int = 256
-) -> Views:
+) -> PartialViews:
     """The views of normalised clouds.
 
     Args:
@@ -65,7 +92,7 @@ def observe(
     kept = gather(points, farthest_points(points, min(count, points.shape[1])))
     look = _look(camera)
     depth, centre, half = _depth_image(points, camera, look)
-    return Views(
+    return PartialViews(
         points=kept,
         normals=surface_normals(kept, points, camera),
         camera=camera,
@@ -77,14 +104,11 @@ def observe(
 
 
 def surface_normals(
-    points: Float[Tensor, "B K 3"],
-    cloud: Float[Tensor, "B N 3"],
-    camera: Float[Tensor, "B 3"],
-    neighbours: int = 16,
+    points: Float[Tensor, "B K 3"], cloud: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B K 3"]:
     """Direction of least spread of the nearest points of `cloud`, turned towards the camera."""
     around = torch.cat(
-        [_neighbours(p[None], c[None], neighbours) for p, c in zip(points, cloud, strict=True)]
+        [_neighbours(p[None], c[None], NEIGHBOURS) for p, c in zip(points, cloud, strict=True)]
     )
     around = around - around.mean(-2, keepdim=True)
     _, vectors = torch.linalg.eigh(around.mT @ around)
@@ -107,42 +131,15 @@ def _look(camera: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 3"]:
 
 
 def _depth_image(
-    points: Float[Tensor, "B N 3"],
-    camera: Float[Tensor, "B 3"],
-    look: Float[Tensor, "B 3 3"],
-    cells: int = 24,
+    points: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"], look: Float[Tensor, "B 3 3"]
 ) -> tuple[Float[Tensor, "B G G"], Float[Tensor, "B 2"], Float[Tensor, " B"]]:
     seen = (points - camera[:, None]) @ look.mT
-    image = seen[..., :2] / seen[..., 2:].clamp_min(1e-3)
+    image = seen[..., :2] / seen[..., 2:].clamp_min(LEAST_DEPTH)
     low, high = image.amin(1), image.amax(1)
-    centre, half = (low + high) / 2, (high - low).amax(-1).clamp_min(1e-6) / 2 * 1.001
-    cell = ((image - centre[:, None]) / half[:, None, None] * 0.5 + 0.5) * cells
-    cell = cell.long().clamp(0, cells - 1)
-    depth = torch.full((len(points), cells * cells), FAR, dtype=points.dtype, device=points.device)
-    depth = depth.scatter_reduce(1, cell[..., 1] * cells + cell[..., 0], seen[..., 2], "amin")
-    depth = F.pad(depth.unflatten(1, (1, cells, cells)), (2, 2, 2, 2), value=FAR)
+    centre, half = (low + high) / 2, (high - low).amax(-1).clamp_min(TINY) / 2 * MARGIN
+    cell = ((image - centre[:, None]) / half[:, None, None] * 0.5 + 0.5) * CELLS
+    cell = cell.long().clamp(0, CELLS - 1)
+    depth = torch.full((len(points), CELLS * CELLS), FAR, dtype=points.dtype, device=points.device)
+    depth = depth.scatter_reduce(1, cell[..., 1] * CELLS + cell[..., 0], seen[..., 2], "amin")
+    depth = F.pad(depth.unflatten(1, (1, CELLS, CELLS)), (2, 2, 2, 2), value=FAR)
     return -F.max_pool2d(-depth, 3, 1)[:, 0], centre, half
-
-
-@torch.no_grad()
-def free_and_hidden(
-    views: Views, points: Float[Tensor, "B M 3"], tolerance: float
-) -> tuple[Bool[Tensor, "B M"], Bool[Tensor, "B M"]]:
-    """Whether each point would be seen in empty space, and whether something hides it.
-
-    Neither: it lies within `tolerance` of what the camera saw there. Points on the background
-    are free: the object would have been seen.
-
-    Args:
-        views: B views.
-        points: In the frame of each view.
-        tolerance: Normalised length along the ray.
-    """
-    seen = (points - views.camera[:, None]) @ views.look.mT
-    z = seen[..., 2]
-    cells = views.depth.shape[-1] - 2
-    image = seen[..., :2] / z.clamp_min(1e-3)[..., None]
-    cell = (image - views.centre[:, None]) / views.half[:, None, None] * 0.5 + 0.5
-    cell = (cell * cells + 1).floor().long().clamp(0, cells + 1)
-    depth = views.depth.flatten(1).gather(1, cell[..., 1] * (cells + 2) + cell[..., 0])
-    return z < depth - tolerance, z > depth + tolerance

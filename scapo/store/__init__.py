@@ -65,7 +65,7 @@ def dataset(
         folder: A data set, a category's or a split's folder.
         category: Needed where the folder holds several.
         split: train, val, test or another that is there.
-        names: Tensors of an item; None for all of CONTRACT 3 but `color`.
+        names: Tensors of an item; None for all of the layout but `color`.
 
     Raises:
         StoreError: No such split, or more than one fits; a broken manifest.

@@ -9,8 +9,8 @@ file so that a killed run can never pair the weights of one step with the state 
 from __future__ import annotations
 
 import platform
-import typing
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,9 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from scapo.categories import CATEGORIES
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.store.files import CHECKPOINT, Arrays, Header, read, write
-from scapo.store.schema import StoreError
+from scapo.store.json_records import StoreError, from_json
+from scapo.types import Supervision
 
 T = TypeVar("T")
 
@@ -43,13 +45,16 @@ def load_arrays(module: nn.Module, arrays: Arrays, where: Path, prefix: str = ""
     """Fill a module's state dict.
 
     Raises:
-        StoreError: A tensor is missing, left over or of another shape.
+        StoreError: A tensor is missing, left over, of another shape, or not finite.
     """
     state = {
         name.removeprefix(prefix): torch.from_numpy(value.copy())
         for name, value in arrays.items()
         if name.startswith(prefix)
     }
+    for name, tensor in state.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise StoreError(f"{where}: tensor {name!r}: expected finite numbers, found others")
     try:
         module.load_state_dict(state)
     except RuntimeError as error:
@@ -57,25 +62,43 @@ def load_arrays(module: nn.Module, arrays: Arrays, where: Path, prefix: str = ""
         raise StoreError(f"{where}: expected the method's tensors, found {found}") from error
 
 
-def adam_arrays(optimizer: torch.optim.Optimizer) -> Arrays:
-    """Adam's state as `adam/<parameter number>/<name>`, numbered as its parameter groups are."""
+def optimiser_arrays(optimizer: torch.optim.Optimizer) -> Arrays:
+    """Its state as `adam/<parameter number>/<name>`, numbered as its parameter groups are."""
     state: dict[int, dict[str, Tensor]] = optimizer.state_dict()["state"]
     return {
-        f"adam/{number}/{name}": array(value)
+        f"{_prefix(optimizer)}{number}/{name}": array(value)
         for number, values in state.items()
         for name, value in values.items()
+        if isinstance(value, Tensor)
     }
 
 
-def load_adam(optimizer: torch.optim.Optimizer, arrays: Arrays) -> None:
-    """The inverse of `adam_arrays`; learning rates stay as they are."""
+def load_optimiser(optimizer: torch.optim.Optimizer, arrays: Arrays, where: Path) -> None:
+    """The inverse of `optimiser_arrays`; learning rates stay as they are.
+
+    Raises:
+        StoreError: The arrays are not those of such an optimiser.
+    """
+    parameters = [one for group in optimizer.param_groups for one in group["params"]]
+    prefix = _prefix(optimizer)
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in arrays.items():
-        if key.startswith("adam/"):
-            _, number, name = key.split("/")
+        if key.startswith(prefix):
+            number, _, name = key.removeprefix(prefix).partition("/")
+            known = number.isascii() and number.isdigit() and int(number) < len(parameters)
+            shape = tuple(parameters[int(number)].shape) if known else None
+            if value.shape not in ((), shape):
+                raise StoreError(
+                    f"{where}: tensor {key!r}: expected the state of one of {len(parameters)} "
+                    f"parameters, of its shape {shape}, found {value.shape}"
+                )
             state.setdefault(int(number), {})[name] = torch.from_numpy(value.copy())
     groups = optimizer.state_dict()["param_groups"]
     optimizer.load_state_dict({"state": state, "param_groups": groups})
+
+
+def _prefix(optimizer: torch.optim.Optimizer) -> str:
+    return f"{type(optimizer).__name__.lower()}/"
 
 
 def versions() -> dict[str, str]:
@@ -110,36 +133,74 @@ def write_checkpoint(path: Path, module: nn.Module, header: Header) -> str:
     return write(path, to_arrays(module), header)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CheckpointHeader:
+    """What a checkpoint says of itself, as far as anything here reads it."""
+
+    method: str
+    category: str
+    config: dict[str, Any]
+    seed: int = 0
+    data_digest: str = ""
+    supervision: tuple[Supervision, ...] = ()
+    parameters: int = 0
+    steps: int = 0
+    moment: tuple[int, ...] = ()
+    """Stage, whether it is started, and its epoch: tells what was saved first."""
+    finished: bool = False
+    commit: str = ""
+    machine: dict[str, str | int] = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    normalisation: dict[str, str | float] = field(default_factory=dict)
+
+
+RUN_FIELDS = ("seed", "data_digest", "supervision", "steps", "finished", "versions")
+"""What the checkpoint of a run says beside what builds the method."""
+
+
 def read_checkpoint(path: Path) -> tuple[Arrays, Header]:
     """Weights and header of a checkpoint or of the run folder that holds one.
 
     Raises:
-        StoreError: None there, or another format.
+        StoreError: None there, another format, or a header without what builds a method or with
+            values of other types than those of `CheckpointHeader`.
     """
-    return read(path / WEIGHTS if path.is_dir() else path, CHECKPOINT)
+    path = path / WEIGHTS if path.is_dir() else path
+    arrays, header = read(path, CHECKPOINT)
+    check_header(header, f"{path}: header")
+    return arrays, header
+
+
+def check_header(header: object, where: str) -> CheckpointHeader:
+    """The header of a checkpoint or of a training state.
+
+    Raises:
+        StoreError: As `read_checkpoint`.
+    """
+    known = from_json(CheckpointHeader, header, where)
+    if known.category not in CATEGORIES:
+        raise StoreError(
+            f"{where}: category: expected one of {', '.join(CATEGORIES)}, found {known.category!r}"
+        )
+    return known
+
+
+def require_fields(header: Header, names: Iterable[str], where: object) -> None:
+    """Refuse a header without one of the fields `names`.
+
+    Raises:
+        StoreError: Naming file and field.
+    """
+    missing = [name for name in names if name not in header]
+    if missing:
+        raise StoreError(f"{where}: header: expected field {missing[0]!r}, found none")
 
 
 def config_from(kind: type[T], data: object, where: str) -> T:
     """A configuration dataclass from its JSON form, nested ones included.
 
     Raises:
-        StoreError: A field is unknown; missing ones take their default.
+        StoreError: A field is unknown or of another type; missing ones take their default.
     """
-    if not isinstance(data, dict):
-        raise StoreError(f"{where}: expected an object, found {type(data).__name__}")
-    hints = typing.get_type_hints(kind)
-    names = {item.name for item in fields(kind)}  # pyright: ignore[reportArgumentType]
-    unknown = sorted(set(data) - names)
-    if unknown:
-        raise StoreError(f"{where}: expected fields of {kind.__name__}, found {unknown[0]!r}")
-    return kind(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in data})
-
-
-def _value(hint: Any, value: object, where: str) -> object:  # noqa: ANN401
-    if isinstance(hint, type) and is_dataclass(hint):
-        return config_from(hint, value, where)
-    return _frozen(value)
-
-
-def _frozen(value: object) -> object:
-    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
+    return from_json(kind, data, where, others="refuse", link=".")

@@ -20,6 +20,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from scapo.store.json_records import parse_json
 from scapo.store.schema import StoreError
 
 SAMPLES = "scapo-samples/1"
@@ -50,7 +51,11 @@ def sha256_file(path: Path) -> str:
 
 
 def write_bytes(path: Path | str, data: bytes) -> None:
-    """Write through a temporary name in the same folder, flushed to disk before the rename."""
+    """Write through a temporary name in the same folder, flushed to disk before the rename.
+
+    Raises:
+        OSError: It cannot be written; the file it names is `path`.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{secrets.token_hex(8)}.tmp")
@@ -60,6 +65,8 @@ def write_bytes(path: Path | str, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+    except OSError as error:  # a full disk is reported without a name, or with the temporary one
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         with suppress(OSError):  # usually gone; else the first error is the one to report
             temporary.unlink()
@@ -126,7 +133,7 @@ def read_header(path: Path | str, expected: str | None = None) -> Header:
             f"{path}: expected the metadata entry 'scapo', found {sorted(metadata) or 'none'}"
         )
     try:
-        header: object = json.loads(metadata["scapo"])
+        header: object = parse_json(metadata["scapo"])
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: expected JSON in the header, found {error}") from error
     if not isinstance(header, dict):
@@ -155,6 +162,19 @@ def read(
     except (SafetensorError, TypeError, AttributeError, OSError) as error:
         raise StoreError(f"{path}: expected numpy-readable tensors, found {error}") from error
     return arrays, header
+
+
+def tensor_names(path: Path) -> set[str]:
+    """The names of a file's tensors.
+
+    Raises:
+        StoreError: No such file, or not safetensors.
+    """
+    try:
+        with _open(path) as file:
+            return set(file.keys())
+    except (SafetensorError, OSError) as error:
+        raise StoreError(f"{path}: expected a safetensors file, found {error}") from error
 
 
 def require(path: Path, names: Iterable[str], there: Iterable[str]) -> None:

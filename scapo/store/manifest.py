@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: MIT
-"""`manifest.json`: what a split holds and what made it (CONTRACT 3)."""
+"""`manifest.json`: what a split holds and what made it (docs/data-format.md)."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, is_dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 
-from scapo.types import JointSpec
+from scapo.categories import JointSpec
+from scapo.geometry.matrices import rotation_error
+from scapo.store.json_records import StoreError, from_json, read_json
 
 FORMAT = "scapo-manifest/1"
 
 
-class ManifestError(ValueError):
+class ManifestError(StoreError):
     """The manifest is not valid: `path: field: expected, found`."""
 
 
@@ -48,6 +50,10 @@ class Instance:
     """The URDF joint of each category joint."""
     sign: tuple[float, ...]
     """state = sign * (q - rest)."""
+    trait: str = ""
+    """What sets it apart from the training shapes, in `test-ood`; not stored where empty."""
+    account: tuple[str, ...] = ()
+    """How a model was read, one sentence each: joints, size, repairs; not stored where empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,12 +75,20 @@ class Manifest:
     plan_digest: str
     digest: str
     """Of the data; ours is `shards_digest`, other writers may have their own."""
-    statistics: dict[str, float]
+    statistics: dict[str, float] = field(default_factory=dict)
     """Facts of the run that no reader needs, such as the share of views redrawn."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Object -> reason, of those refused or given up; not written where there are none."""
 
     def to_json(self) -> str:
         """Indented, sorted, with a final newline."""
         data = {"format": FORMAT, **asdict(self)}
+        for row in data["instances"]:
+            for name in ("trait", "account"):
+                if not row[name]:
+                    del row[name]
+        if not self.left_out:
+            del data["left_out"]
         return json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n"
 
 
@@ -90,67 +104,17 @@ def read_manifest(path: Path | str) -> Manifest:
         ManifestError: No file, broken JSON, another format, a missing or contradictory field.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"), parse_constant=_no_number)
-    except FileNotFoundError as error:
-        raise ManifestError(f"{path}: expected a manifest, found no file") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise ManifestError(f"{path}: expected JSON, found {error}") from error
+    if not path.exists():
+        raise ManifestError(f"{path}: expected a manifest, found no file")
+    data = read_json(path, ManifestError)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise ManifestError(f"{path}: expected format {FORMAT!r}, found {found!r}")
-    manifest: Manifest = _record(Manifest, {"statistics": {}, **data}, str(path))
+    manifest = from_json(Manifest, data, str(path), error=ManifestError)
     _check_joints(path, manifest)
     _check_instances(path, manifest)
     _check_shards(path, manifest)
     return manifest
-
-
-def _no_number(text: str) -> None:
-    raise ValueError(f"{text}, which JSON lacks")
-
-
-def _record(cls: Any, data: object, where: str) -> Any:  # noqa: ANN401
-    """A dataclass from JSON, each field checked against its annotation."""
-    if not isinstance(data, dict):
-        raise ManifestError(f"{where}: expected an object, found {type(data).__name__}")
-    hints = get_type_hints(cls)
-    missing = [name for name in hints if name not in data]
-    if missing:
-        raise ManifestError(f"{where}: expected field {missing[0]!r}, found none")
-    return cls(
-        **{name: _value(hint, data[name], f"{where}: {name}") for name, hint in hints.items()}
-    )
-
-
-_SCALARS: dict[Any, tuple[str, tuple[type, ...]]] = {
-    str: ("text", (str,)),
-    int: ("an integer", (int,)),
-    float: ("a number", (int, float)),
-}
-
-
-def _value(hint: Any, value: object, where: str) -> Any:  # noqa: ANN401
-    """A JSON value as the annotation `hint` has it; lists become tuples."""
-    kind, inner = get_origin(hint), get_args(hint)
-    if is_dataclass(hint):
-        return _record(hint, value, where)
-    if kind is tuple:
-        _expect(isinstance(value, list), f"{where}: expected a list, found {value!r}")
-        items = enumerate(cast("list[object]", value))
-        return tuple(_value(inner[0], item, f"{where}[{i}]") for i, item in items)
-    if kind is dict:
-        _expect(isinstance(value, dict), f"{where}: expected an object, found {value!r}")
-        pairs = cast("dict[str, object]", value).items()
-        return {key: _value(inner[1], item, f"{where}[{key!r}]") for key, item in pairs}
-    if kind is Literal:
-        _expect(value in inner, f"{where}: expected one of {', '.join(inner)}, found {value!r}")
-    if hint in _SCALARS:
-        name, types = _SCALARS[hint]
-        fits = isinstance(value, types) and not isinstance(value, bool)
-        _expect(fits, f"{where}: expected {name}, found {value!r}")
-        return hint(value)
-    return value
 
 
 def _expect(holds: bool, message: str) -> None:
@@ -164,7 +128,7 @@ def _unique(path: Path, what: str, names: Sequence[str]) -> None:
 
 
 def _check_joints(path: Path, manifest: Manifest) -> None:
-    """Part 0 is the base, joint j links it to part j + 1 (CONTRACT 1)."""
+    """Part 0 is the base, joint j links it to part j + 1 (docs/data-format.md)."""
     parts, joints = len(manifest.parts), len(manifest.joints)
     _expect(
         parts == joints + 1,
@@ -210,10 +174,7 @@ def _is_similarity(rows: tuple[tuple[float, ...], ...]) -> bool:
         return False
     linear = np.array(rows)[:3, :3]
     determinant = np.linalg.det(linear)
-    if not determinant > 0:
-        return False
-    rotation = linear / np.cbrt(determinant)
-    return bool((abs(rotation @ rotation.T - np.eye(3)) < 1e-3).all())
+    return bool(determinant > 0 and rotation_error(linear / np.cbrt(determinant)) < 1e-3)
 
 
 def _check_shards(path: Path, manifest: Manifest) -> None:

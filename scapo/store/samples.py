@@ -6,8 +6,8 @@ A split held in memory on the training device, batched by index there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import SupportsIndex
 
@@ -18,10 +18,11 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from scapo.store.files import SAMPLES, Arrays, read_header, require
+from scapo.records import map_tensors, take
+from scapo.store.files import SAMPLES, Arrays, read_header, require, tensor_names
 from scapo.store.schema import LAYOUT, UNLABELLED, StoreError, check_samples
-from scapo.store.split import Split, open_split
-from scapo.types import Joints, Labels, Observation
+from scapo.store.split import Split, check_bytes, open_split
+from scapo.types import Joints, Labels, Observation, Supervision
 
 TENSORS = (
     "points",
@@ -36,10 +37,14 @@ TENSORS = (
 )
 
 
+OPTIONAL = ("color", "sensor")
+"""What a split may have besides."""
+
+
 class SampleDataset(Dataset[dict[str, Tensor]]):
     """Samples of one split; an item is a dict of tensors that `default_collate` stacks.
 
-    Names and shapes are those on disk (CONTRACT 3) without the leading sample dimension; `part`
+    Names and shapes are those on disk without the leading sample dimension; `part`
     is int64 with -1 for background, `index` the position in the split. Shards are memory-mapped
     and opened in the process that reads them, so the object pickles into DataLoader workers; a
     whole batch is fetched at once (`__getitems__`), one read per shard it touches.
@@ -75,7 +80,7 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
 
         Raises:
             IndexError: There is no such sample.
-            StoreError: A shard is not what the manifest and CONTRACT 3 say.
+            StoreError: A shard is not what the manifest and the layout say.
         """
         index = self._inside(indices)
         shard_of = np.searchsorted(self._ends, index, side="right")
@@ -94,7 +99,7 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         return batch
 
     def _room(self, name: str, count: int) -> np.ndarray:
-        """Zeros for `count` samples of a tensor; one that CONTRACT 3 lacks is as in shard 0."""
+        """Zeros for `count` samples of a tensor; one that the layout lacks is as in shard 0."""
         if name in LAYOUT:
             return np.zeros(self.split.shapes(count)[name], LAYOUT[name][0])
         if not self.split.manifest.shards:
@@ -127,6 +132,7 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
                     f"{path}: expected numpy-readable tensors, found {error}"
                 ) from error
             check_samples(path, arrays, self.split.manifest, shard.first, shard.count)
+            check_bytes(path, shard.sha256)
             self._open[number] = arrays
         return self._open[number]
 
@@ -145,10 +151,26 @@ def dataset(
     return SampleDataset(open_split(folder, category, split), names)
 
 
+def observed(split: Split) -> tuple[str, ...]:
+    """The names of all that a split has for methods: colours and camera centres where it has them.
+
+    Raises:
+        StoreError: Its first shard cannot be read.
+    """
+    if not split.manifest.shards:
+        return TENSORS
+    there = tensor_names(split.folder / split.manifest.shards[0].file)
+    return (*TENSORS, *(name for name in OPTIONAL if name in there))
+
+
 def observe(batch: dict[str, Tensor]) -> Observation:
-    """What a method may see of a batch."""
+    """What a method may see of a batch, as far as it is there (`observed`)."""
     color = batch.get("color")
-    return Observation(points=batch["points"], color=None if color is None else color.float() / 255)
+    return Observation(
+        points=batch["points"],
+        color=None if color is None else color.float() / 255,
+        sensor=batch.get("sensor"),
+    )
 
 
 def label(batch: dict[str, Tensor]) -> Labels:
@@ -171,33 +193,43 @@ class TrainingData:
     """Only what the method's supervision allows is handed on."""
     digest: str
     """Of the manifest."""
+    instance: Int[Tensor, " B"] | None = None
+    """Which object each cloud shows, where that is known."""
+    validation: TrainingData | None = None
+    """Clouds that are not trained on."""
+
+    def keep(self, supervision: frozenset[Supervision]) -> TrainingData:
+        """With the labels that a method with this supervision may see."""
+        below = None if self.validation is None else self.validation.keep(supervision)
+        return replace(self, labels=self.labels.keep(supervision), validation=below)
 
     def to(self, device: str) -> TrainingData:
         """On the device."""
-        return TrainingData(
-            observation=Observation(points=self.observation.points.to(device)),
-            labels=map_labels(self.labels, lambda tensor: tensor.to(device)),
-            digest=self.digest,
-        )
+        return map_tensors(self, lambda tensor: tensor.to(device))
 
     def batch(self, index: Tensor) -> tuple[Observation, Labels]:
         """The samples of `index`."""
-        points = self.observation.points[index]
-        return Observation(points=points), map_labels(self.labels, lambda tensor: tensor[index])
+        return take((self.observation, self.labels), index)
+
+    def held_out(self) -> TrainingData:
+        """Every tenth object with all its clouds for validation, the others for training.
+
+        Every tenth cloud where it is not known which object a cloud shows.
+
+        Raises:
+            ValueError: Nothing would be left.
+        """
+        count = self.observation.points.shape[0]
+        number = torch.arange(count) if self.instance is None else self.instance
+        which = number.unique(return_inverse=True)[1].to(self.observation.points.device)
+        out = which % HELD_OUT == 0
+        if bool(out.all()):
+            raise ValueError("training data: expected an object to train on, and one to hold out")
+        return replace(take(self, ~out), validation=take(self, out))
 
 
-def map_labels(labels: Labels, change: Callable[[Tensor], Tensor]) -> Labels:
-    """Labels with every tensor that is there changed."""
-    joints = labels.joints
-    return Labels(
-        part=None if labels.part is None else change(labels.part),
-        camera_T_part=None if labels.camera_T_part is None else change(labels.camera_T_part),
-        joints=None
-        if joints is None
-        else Joints(
-            pivot=change(joints.pivot), axis=change(joints.axis), state=change(joints.state)
-        ),
-    )
+HELD_OUT = 10
+"""Of so many training objects one is for validation, where there is no split for it."""
 
 
 def read_training_data(split: Split) -> TrainingData:
@@ -206,8 +238,11 @@ def read_training_data(split: Split) -> TrainingData:
     Raises:
         StoreError: A shard is missing or not as the manifest says.
     """
-    samples = SampleDataset(split)
+    samples = SampleDataset(split, observed(split))
     batch = samples.batch(torch.arange(len(samples)))
     return TrainingData(
-        observation=observe(batch), labels=label(batch), digest=split.manifest.digest
+        observation=observe(batch),
+        labels=label(batch),
+        digest=split.manifest.digest,
+        instance=batch["instance"],
     )

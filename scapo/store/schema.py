@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a shard of samples holds, tensor by tensor, and the check that it does (CONTRACT 3)."""
+"""What a shard of samples holds, tensor by tensor, and the check that it does."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from scapo.geometry.matrices import is_rigid
+from scapo.store.json_records import StoreError
 from scapo.store.manifest import Manifest
+
+__all__ = ["LAYOUT", "UNLABELLED", "StoreError", "check_samples", "check_shape", "sample_shapes"]
 
 UNLABELLED = 255
 """Part index of background and unlabelled points on disk; -1 in memory."""
@@ -28,12 +32,17 @@ LAYOUT: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "visible": ("float32", ("P",)),
     "camera": ("float32", (6,)),
     "instance": ("int32", ()),
+    "sensor": ("float32", (3,)),
+    "alike": ("uint8", (24,)),
+    "alike_base": ("float32", (24, 4, 4)),
+    "alike_state": ("float32", (24, "J")),
+    "alike_part": ("uint8", (24, "P")),
 }
-"""dtype and shape of one sample's tensors; on disk the samples of a shard are stacked."""
-
-
-class StoreError(ValueError):
-    """A file is not what it should be: `path: what was expected, what was found`."""
+"""dtype and shape of one sample's tensors; on disk the samples of a shard are stacked. `color` is
+optional, and so are `sensor`, the camera's centre in metres where clouds are not in its frame, and
+the four of ambiguity (docs/ambiguity.md)."""
+ALIKE = ("alike", "alike_base", "alike_state", "alike_part")
+"""The tensors of ambiguity, all there or none."""
 
 
 @runtime_checkable
@@ -99,7 +108,8 @@ def check_samples(
                 f"{path}: tensor {name!r}: expected dtype {LAYOUT[name][0]}, found {array.dtype}"
             )
         check_shape(path, name, array, shapes[name])
-        expected, bad = _impossible(name, array, manifest)
+        turns = name in ("alike", "alike_part")
+        expected, bad = (_impossible_turns if turns else _impossible)(name, array, manifest)
         if bad.any():
             at = tuple(int(i) for i in np.argwhere(bad)[0])
             place = f"sample {first + at[0]}" + "".join(f"[{i}]" for i in at[1:])
@@ -109,6 +119,15 @@ def check_samples(
             raise StoreError(
                 f"{path}: tensor {name!r}, {place}: expected {expected}, found {found}"
             )
+
+
+def _impossible_turns(name: str, array: np.ndarray, manifest: Manifest) -> tuple[str, np.ndarray]:
+    """As `_impossible`, of the turns that look alike."""
+    del manifest
+    index = np.arange(array.shape[-1])
+    if name == "alike":  # no turn at all always looks alike
+        return "0 or 1, and 1 for the first turn", (array > 1) | ((index == 0) & (array != 1))
+    return "every part once", np.asarray((np.sort(array, -1) != index).any(-1))
 
 
 def _impossible(name: str, array: np.ndarray, manifest: Manifest) -> tuple[str, np.ndarray]:
@@ -127,21 +146,10 @@ def _impossible(name: str, array: np.ndarray, manifest: Manifest) -> tuple[str, 
         with np.errstate(over="ignore"):
             norm = np.linalg.norm(array, axis=-1)
         return "a unit vector", ~(abs(norm - 1) < TOLERANCE)
-    if name == "camera_T_part":
-        return "a rigid motion", ~_is_rigid(array)
+    if name in ("camera_T_part", "alike_base"):
+        return "a rigid motion", ~is_rigid(array, TOLERANCE)
     if name == "camera":
         lower = np.array([0, 0, -np.inf, -np.inf, 0, 0])
         wanted = "fx, fy, cx, cy, width, height with positive focal lengths and size"
         return wanted, ~np.all((array > lower) & np.isfinite(array), axis=-1)
     return "a finite number", ~np.isfinite(array)
-
-
-def _is_rigid(pose: np.ndarray) -> np.ndarray:
-    """Whether the last row is 0 0 0 1 and the rest a rotation and a finite translation."""
-    finite = np.asarray(np.isfinite(pose).all((-1, -2)))
-    pose = np.where(finite[..., None, None], pose, 0).astype(np.float64)
-    rotation = pose[..., :3, :3]
-    gap = rotation @ rotation.swapaxes(-1, -2) - np.eye(3)
-    proper = (abs(gap) < TOLERANCE).all((-1, -2)) & (np.linalg.det(rotation) > 0)
-    last = (abs(pose[..., 3, :] - np.array([0, 0, 0, 1])) < TOLERANCE).all(-1)
-    return finite & proper & last

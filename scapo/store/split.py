@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Samples, predictions and checkpoints on disk; what is read is validated here.
 
-Layout: `DIR/<category>/<split>/manifest.json` and shards beside it (CONTRACT 3). One file is
-written and read by `write` and `read` (of `files`), a split through `open_split` and `dataset`.
+Layout: `DIR/<category>/<split>/manifest.json` and shards beside it (docs/data-format.md). One file
+is written and read by `write` and `read` (of `files`), a split through `open_split` and `dataset`.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -23,7 +22,9 @@ from scapo.store.files import (
     require,
     sha256_file,
 )
-from scapo.store.manifest import Manifest, ManifestError, read_manifest
+from scapo.store.json_records import parse_json
+from scapo.store.manifest import Manifest, read_manifest
+from scapo.store.regular import read_regular
 from scapo.store.schema import LAYOUT, StoreError, check_samples, sample_shapes
 
 
@@ -37,13 +38,10 @@ class Split:
             StoreError: There is no manifest there, or it is not valid.
         """
         self.folder = folder
-        try:
-            self.manifest: Manifest = read_manifest(folder / "manifest.json")
-        except ManifestError as error:
-            raise StoreError(str(error)) from error
+        self.manifest: Manifest = read_manifest(folder / "manifest.json")
 
     def shards(self, names: tuple[str, ...] | None = None) -> Iterator[Arrays]:
-        """Arrays of each shard in order, checked against the manifest and CONTRACT 3.
+        """Arrays of each shard in order, checked against the manifest and the layout.
 
         Raises:
             StoreError: A shard is missing, of another split, size or shape, or holds values that
@@ -54,6 +52,7 @@ class Split:
             arrays, header = read(path, SAMPLES, names)
             self.check_header(path, header)
             check_samples(path, arrays, self.manifest, shard.first, shard.count)
+            check_bytes(path, shard.sha256)
             yield arrays
 
     def arrays(self, *names: str) -> Arrays:
@@ -70,7 +69,7 @@ class Split:
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
     def shapes(self, count: int) -> dict[str, tuple[int, ...]]:
-        """Expected shape of each sample tensor for `count` samples (CONTRACT 3)."""
+        """Expected shape of each sample tensor for `count` samples (docs/data-format.md)."""
         return sample_shapes(self.manifest, count)
 
     def check_header(self, path: Path, header: Header) -> None:
@@ -94,9 +93,32 @@ class Split:
             path = self.folder / shard.file
             if not path.is_file():
                 raise StoreError(f"{path}: expected a shard of the manifest, found none")
-            found = sha256_file(path)
-            if found != shard.sha256:
-                raise StoreError(f"{path}: expected sha256 {shard.sha256}, found {found}")
+            check_bytes(path, shard.sha256, again=True)
+
+
+_CHECKED: set[tuple[Path, str, int, int]] = set()
+"""Path, SHA-256, length and time of change of the shards that this process has compared."""
+
+
+def check_bytes(path: Path, sha256: str, *, again: bool = False) -> None:
+    """Compare a shard's bytes with the manifest, once in a process unless the file was changed.
+
+    Args:
+        path: Of the shard.
+        sha256: By the manifest.
+        again: Also where it was compared before.
+
+    Raises:
+        StoreError: They differ.
+    """
+    state = path.stat()
+    key = (path.absolute(), sha256, state.st_size, state.st_mtime_ns)
+    if key in _CHECKED and not again:
+        return
+    found = sha256_file(path)
+    if found != sha256:
+        raise StoreError(f"{path}: expected sha256 {sha256}, found {found}")
+    _CHECKED.add(key)
 
 
 def find_split(folder: Path | str, category: str | None, split: str) -> Path:
@@ -142,7 +164,7 @@ def _is_split(folder: Path, category: str | None, split: str) -> bool:
     if not path.is_file():
         return False
     try:
-        data: object = json.loads(path.read_text(encoding="utf-8"))
+        data: object = parse_json(read_regular(path))
     except (OSError, ValueError, RecursionError):
         return folder.name == split
     if not isinstance(data, dict):

@@ -12,16 +12,18 @@ batch, gradients are summed, and the first rank alone starts stages, writes and 
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors.numpy import load, save
 from torch import Tensor
+from torch.optim import Optimizer
 
 from scapo.method import AbstractMethod, Stage, Step, evenly
 from scapo.store import checkpoint
@@ -31,7 +33,7 @@ from scapo.store.schema import StoreError
 from scapo.training import precision
 from scapo.training.distributed import average_buffers, present
 from scapo.training.log import BAD_BATCH, Log, draw_progress, save_batch
-from scapo.training.optimiser import Descent, NotFiniteError, adam, schedule
+from scapo.training.optimiser import Descent, NotFiniteError, make_optimiser, schedule
 from scapo.training.precision import Arithmetic
 from scapo.training.run_folder import Position, RunFolder, State, kept
 
@@ -90,6 +92,9 @@ def fit(
 ) -> None:
     """Run all stages of a method and leave the run in `folder`.
 
+    Stages with a validation pass take `data.validation`, or else every tenth object of `data`,
+    which is then not trained on.
+
     Writes config.json, metrics.jsonl, tensorboard/ (where that package is installed), pictures/
     (where matplotlib is), checkpoint.safetensors and training.safetensors. With `resume` a run in
     that folder is continued, or left as it is when it was finished.
@@ -116,11 +121,11 @@ class Trainer:
     ) -> None:
         """Move method and data to the device."""
         self.method = method.to(config.device)
-        allowed = data.labels.keep(method.supervision)
-        self.data = TrainingData(
-            observation=data.observation, labels=allowed, digest=data.digest
-        ).to(config.device)
         self.config, self.listener, self.ranks = config, listener, present()
+        self.validated = any(stage.validate_every for stage in method.stages())
+        if self.validated and data.validation is None:
+            data = data.held_out()
+        self.data = data.keep(method.supervision).to(config.device)
         seed = config.seed + (self.ranks.rank << 32)  # every rank augments in its own way
         self.state = State(
             position=Position(),
@@ -140,6 +145,8 @@ class Trainer:
 
     def _about(self) -> dict[str, Any]:
         training = {**asdict(self.config.arithmetic), "clip": self.config.clip}
+        if self.validated and self.data.validation is not None:
+            training["validation"] = self.data.validation.digest
         return {
             "seed": self.config.seed,
             "data_digest": self.data.digest,
@@ -179,22 +186,32 @@ class Trainer:
     def _stages(self, moments: Arrays | None) -> None:
         position, stages = self.state.position, self.method.stages()
         if moments is not None and position.scaler:
-            self.descent.scaler.load_state_dict(position.scaler)
+            self._load_scaler(position.scaler)
         if not stages:
             self._start(Stage(name="", epochs=0, lr=0.0))
         while position.stage < len(stages):
             stage = stages[position.stage]
             if not position.started:
                 self._start(stage)
-            optimizer = adam(self.method, stage)
+            optimizer = make_optimiser(self.method, stage)
             if moments is not None:
-                checkpoint.load_adam(optimizer, moments)
+                checkpoint.load_optimiser(optimizer, moments, self.folder.path)
                 moments = None
             self._stage(stage, optimizer)
+            self._take_best()
             position.stage, position.epoch, position.started = position.stage + 1, 0, False
             self._draw(stage)
             self._save(None)
         self._save(None, finished=True)
+
+    def _load_scaler(self, state: dict[str, int | float]) -> None:
+        try:
+            self.descent.scaler.load_state_dict(state)
+        except (KeyError, RuntimeError) as error:
+            raise StoreError(
+                f"{self.folder.path / checkpoint.TRAINING}: header: position: scaler: expected the "
+                f"state of a gradient scaler, found one without {error}"
+            ) from error
 
     def _start(self, stage: Stage) -> None:
         """The method's start of a stage, by the first rank for all; saved, as it may take long."""
@@ -211,7 +228,7 @@ class Trainer:
         if stage.epochs:
             self._save(None)
 
-    def _stage(self, stage: Stage, optimizer: torch.optim.Adam) -> None:
+    def _stage(self, stage: Stage, optimizer: Optimizer) -> None:
         """The epochs of a stage that are left."""
         position = self.state.position
         used = evenly(self.data.observation.points.shape[0], stage.clouds)
@@ -237,24 +254,56 @@ class Trainer:
             position.spend(stage.name, seconds)
             position.rates[stage.name] = steps * size / seconds
             self.log.scalar("samples_per_second", steps * size / seconds, position.step)
+            if stage.validate_every and position.epoch % stage.validate_every == 0:
+                self._validate(stage)
             if self._due(self.saved, self.config.checkpoint_every):
                 self._save(optimizer)
             every = self.config.pictures_every
             if every is not None and self._due(self.drawn, every) and epoch + 1 < stage.epochs:
                 self._draw(stage)
 
+    @torch.no_grad()
+    def _validate(self, stage: Stage) -> None:
+        """One pass over the validation clouds; the best state so far is kept."""
+        data, position, total = cast("TrainingData", self.data.validation), self.state.position, 0.0
+        count = data.observation.points.shape[0]
+        self.method.eval()
+        noise = torch.Generator(self.config.device).manual_seed(self.config.seed)
+        done = position.epoch / stage.epochs
+        for index in torch.arange(count, device=self.config.device).split(stage.batch):
+            step = Step(stage=stage.name, progress=done, generator=noise, index=index, total=count)
+            loss = self.method.validation_loss(*data.batch(index), step)
+            total += float(loss) * len(index) / count
+        # All ranks hold the same weights, but for rounding: what the first one finds decides.
+        mean = float(self.ranks.every(torch.tensor([total]).double(), self.config.device)[0])
+        self.log.validation(position.step, stage.name, mean)
+        if math.isfinite(mean) and (position.best is None or mean < position.best):
+            state = self.method.state_dict()
+            position.best = mean
+            self.state.best = {name: value.detach().cpu().clone() for name, value in state.items()}
+
+    def _take_best(self) -> None:
+        """The method as it was at the least validation loss of the stage that ends."""
+        if self.state.best:
+            self.method.load_state_dict(self.state.best)
+        self.state.best, self.state.position.best = {}, None
+
     def _due(self, last: float, every: float) -> bool:
         """Whether so many seconds are over; the ranks agree, as each has its own clock."""
         over = torch.tensor([float(time.monotonic() - last > every)], device=self.config.device)
         return bool(self.ranks.total(over) > 0)
 
-    def _step(self, stage: Stage, optimizer: torch.optim.Adam, index: Tensor, done: float) -> None:
+    def _step(self, stage: Stage, optimizer: Optimizer, index: Tensor, done: float) -> None:
         """One batch."""
         rate = schedule(stage, optimizer, done)
         own = self.ranks.share(index)
         share = len(own) / len(index)
-        observation, labels = self.data.batch(own.to(self.config.device))
-        step = Step(stage=stage.name, progress=done, generator=self.state.noise)
+        own = own.to(self.config.device)
+        total = self.data.observation.points.shape[0]
+        step = Step(
+            stage=stage.name, progress=done, generator=self.state.noise, index=own, total=total
+        )
+        observation, labels = self.data.batch(own)
         compute = partial(self.method.losses, observation, labels, step)
         try:
             values = self.descent.step(optimizer, compute, share)
@@ -274,7 +323,7 @@ class Trainer:
         path, step = self.folder.path / BAD_BATCH, self.state.position.step
         found = f"rank {problem.rank} with another"
         if problem.rank == self.ranks.rank:
-            observation, _ = self.data.batch(index.to(self.config.device))
+            observation, _ = self.data.batch(index)
             found = save_batch(path, stage.name, observation.points, index, problem.terms)
         return (
             f"{path}: expected a finite {problem.what} in stage {stage.name!r} at step {step}, "
@@ -289,7 +338,7 @@ class Trainer:
                 self.method, self.data.observation, stage.name, self.log, self.state.position.step
             )
 
-    def _save(self, optimizer: torch.optim.Adam | None, *, finished: bool = False) -> None:
+    def _save(self, optimizer: Optimizer | None, *, finished: bool = False) -> None:
         noises = self.ranks.every(self.state.noise.get_state(), self.config.device)
         self.state.position.scaler = self.descent.scaler.state_dict()
         if self.ranks.first:

@@ -9,7 +9,6 @@ Pictures of a training in progress: the same few clouds each time, where they ca
 from __future__ import annotations
 
 import importlib.util
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -19,11 +18,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo import drawing as draw
-from scapo.drawing import PictureData
+from scapo import pictures as draw
 from scapo.method import AbstractMethod
+from scapo.pictures import PictureData
+from scapo.records import take
 from scapo.store.checkpoint import array
 from scapo.store.files import canonical_json, write, write_bytes
+from scapo.store.json_records import parse_json
 from scapo.types import Observation
 
 PICTURES = "pictures"
@@ -80,6 +81,14 @@ class Log:
             self.scalar(f"{stage}/{name}", value, step)
         self.sums, self.count = {}, 0
 
+    def validation(self, step: int, stage: str, loss: float) -> None:
+        """A line of a validation pass."""
+        if self.file is not None:
+            record = {"step": step, "stage": stage, "validation": loss}
+            self.file.write(canonical_json(record) + "\n")
+            self.file.flush()
+        self.scalar(f"{stage}/validation", loss, step)
+
     def scalar(self, name: str, value: float, step: int) -> None:
         """A number for TensorBoard alone."""
         if self.board is not None:
@@ -103,19 +112,20 @@ class Log:
 
 
 def _continued(path: Path, step: int) -> TextIO:
-    """The file, open for more, without lines after that step."""
-    lines = path.read_text().splitlines() if path.is_file() else []
+    """The file, open for more, without lines after that step and those that a kill cut off."""
+    lines = path.read_bytes().splitlines() if path.is_file() else []
     kept = [line for line in lines if _step_of(line) <= step]
-    write_bytes(path, "".join(f"{line}\n" for line in kept).encode())
+    write_bytes(path, b"".join(line + b"\n" for line in kept))
     return path.open("a")
 
 
-def _step_of(line: str) -> float:
-    """The step of a line; infinite for one that a kill cut off."""
+def _step_of(line: bytes) -> float:
+    """The step of a line; infinite for one that is none of ours."""
     try:
-        return json.loads(line)["step"]
-    except ValueError:
+        step = parse_json(line)["step"]
+    except (ValueError, RecursionError, TypeError, KeyError):
         return float("inf")
+    return step if isinstance(step, int) else float("inf")
 
 
 def _board(folder: Path, step: int) -> Any:  # noqa: ANN401 - None, or a writer of an extra
@@ -160,7 +170,7 @@ def shown(observation: Observation, count: int = SHOWN) -> Observation:
     number = observation.points.shape[0]
     count = min(count, number)
     index = torch.arange(count, device=observation.points.device) * number // count
-    return Observation(points=observation.points[index])
+    return take(observation, index)
 
 
 @torch.no_grad()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One step of the optimiser: loss, gradient over all ranks, clipping, Adam; no step into NaN."""
+"""Steps of an optimiser: loss, gradient over all ranks, clipping, schedule; no step into NaN."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from scapo.method import AbstractMethod, Stage
+from scapo.method import AbstractMethod, Sgd, Stage, StepDecay
 from scapo.training.distributed import BAD_LOSS, FINE, Ranks, sum_gradients
 from scapo.training.precision import Arithmetic, begin_step
 
@@ -93,20 +93,31 @@ class Descent:
         return self.scaler.is_enabled() and self.scaler.get_scale() > SMALLEST_SCALE
 
 
-def adam(method: AbstractMethod, stage: Stage) -> torch.optim.Adam:
+def make_optimiser(method: AbstractMethod, stage: Stage) -> torch.optim.Optimizer:
     """The optimiser of a stage, one group of parameters per group of the stage."""
     groups = [
-        {"params": list(part.parameters()), "lr": stage.lr * group.rate}
+        {
+            "params": list(part.parameters()),
+            "lr": stage.lr * group.rate,
+            "weight_decay": stage.weight_decay
+            if group.weight_decay is None
+            else group.weight_decay,
+        }
         for group in stage.parameters
         for part in [method.get_submodule(group.module) if group.module else method]
     ]
     method.requires_grad_(False)
-    return torch.optim.Adam(groups, lr=stage.lr, weight_decay=stage.weight_decay, fused=True)
+    kind = stage.optimiser
+    if isinstance(kind, Sgd):
+        return torch.optim.SGD(
+            groups, lr=stage.lr, momentum=kind.momentum, nesterov=kind.nesterov, fused=True
+        )
+    return torch.optim.Adam(groups, lr=stage.lr, betas=kind.betas, fused=True)
 
 
 def schedule(stage: Stage, optimizer: torch.optim.Optimizer, done: float) -> float:
     """Set learning rates, and which parameters move, for this share of the stage; the rate."""
-    rate = cosine(stage, done)
+    rate = learning_rate(stage, done)
     for group, settings in zip(stage.parameters, optimizer.param_groups, strict=True):
         settings["lr"] = rate * group.rate
         for parameter in settings["params"]:
@@ -114,6 +125,10 @@ def schedule(stage: Stage, optimizer: torch.optim.Optimizer, done: float) -> flo
     return rate
 
 
-def cosine(stage: Stage, done: float) -> float:
-    """Learning rate when this share of the stage is done: half a cosine from lr to min_lr."""
+def learning_rate(stage: Stage, done: float) -> float:
+    """The stage's rate when this share of it is done."""
+    kind = stage.schedule
+    if isinstance(kind, StepDecay):
+        epoch = math.floor(done * stage.epochs + 1e-6)  # a share is not exact
+        return max(stage.min_lr, stage.lr * kind.factor ** (epoch // kind.every))
     return stage.min_lr + (stage.lr - stage.min_lr) * (1 + math.cos(math.pi * done)) / 2

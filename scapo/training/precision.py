@@ -9,15 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Literal, cast
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
 import torch
-from torch import Tensor
 
-from scapo.geometry.numerics import at_least_float32, matrix_products
+from scapo.geometry.numerics import at_least_float32, before_compiling, matrix_products
 from scapo.method import AbstractMethod
+from scapo.records import map_tensors
 
+T = TypeVar("T")
 Precision = Literal["float32", "bfloat16", "float16"]
 TYPES: dict[Precision, torch.dtype] = {
     "float32": torch.float32,
@@ -74,6 +75,7 @@ def changed(forward: Callable[..., Any], arithmetic: Arithmetic, kind: str) -> C
 
 def compiled(forward: Callable[..., Any], kind: str) -> Callable[..., Any]:
     """By torch.compile, one graph per shape; CUDA graphs take the launches away on CUDA."""
+    before_compiling()
     mode = "reduce-overhead" if kind == "cuda" else "default"
     # A method meets few shapes (whole, cropped, decoded clouds), each of them at every step.
     torch._dynamo.config.cache_size_limit = max(32, torch._dynamo.config.cache_size_limit)
@@ -96,16 +98,9 @@ def _with_tf32(forward: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
-def full(value: Any) -> Any:  # noqa: ANN401
-    """Tensors, and tuples and dataclasses of them, in float32 where they were in half."""
-    if isinstance(value, Tensor):
-        return at_least_float32(value) if value.is_floating_point() else value
-    if isinstance(value, tuple):
-        return tuple(full(item) for item in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        changed = {item.name: full(getattr(value, item.name)) for item in fields(value)}
-        return replace(cast("Any", value), **changed)
-    return value
+def full(value: T) -> T:
+    """Tensors, and records of them, in float32 where they were in half."""
+    return map_tensors(value, lambda one: at_least_float32(one) if one.is_floating_point() else one)
 
 
 def scaler(precision: Precision, device: str) -> torch.amp.GradScaler:

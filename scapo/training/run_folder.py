@@ -9,17 +9,29 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from scapo.method import AbstractMethod
 from scapo.store import checkpoint, provenance
-from scapo.store.files import Arrays, Header, canonical_json, read, read_header, write, write_bytes
-from scapo.store.schema import StoreError
+from scapo.store.files import (
+    Arrays,
+    Header,
+    canonical_json,
+    read,
+    read_header,
+    require,
+    write,
+    write_bytes,
+)
+from scapo.store.json_records import StoreError, from_json
 
 CONFIG = "config.json"
 TIMING = "timing.json"
 """What differs from run to run, apart from all that does not."""
+NOW, BEST = "weights/", "best/"
+"""Of the names of the method's tensors in training.safetensors, now and at the best validation."""
 SAME = ("method", "category", "config", "seed", "data_digest", "supervision", "training")
 """Fields of the header in which a run and its continuation agree."""
 
@@ -38,8 +50,10 @@ class Position:
     """Whether the method's `start` of the stage is done."""
     spent: dict[str, float] = field(default_factory=dict)
     """Seconds of each stage, the start included."""
-    scaler: dict[str, float] = field(default_factory=dict)
+    scaler: dict[str, int | float] = field(default_factory=dict)
     """State of the gradient scaler of float16."""
+    best: float | None = None
+    """The least validation loss of this stage."""
 
     def spend(self, stage: str, seconds: float) -> None:
         """Count time."""
@@ -55,6 +69,19 @@ class State:
     order: torch.Generator
     noise: torch.Generator
     """Of this rank."""
+    best: dict[str, Tensor] = field(default_factory=dict)
+    """The method's tensors at the least validation loss of this stage."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingHeader:
+    """What training.safetensors says of itself."""
+
+    position: Position
+    optimizer: bool
+    """Whether the state of an optimiser is there."""
+    header: dict[str, Any]
+    """As the checkpoint's."""
 
 
 class RunFolder:
@@ -71,6 +98,7 @@ class RunFolder:
             "supervision": sorted(self.method.supervision),
             "parameters": sum(item.numel() for item in self.method.parameters()),
             "steps": position.step,
+            "moment": [position.stage, int(position.started), position.epoch],
             "finished": finished,
             "commit": provenance.commit(),
             "machine": provenance.machine(self.device),
@@ -96,19 +124,66 @@ class RunFolder:
         return there
 
     def load(self, state: State, rank: int = 0) -> tuple[bool, Arrays | None]:
-        """Load the method and `state`; whether the run is finished, and Adam's part of it.
+        """Load the method and `state`; whether the run is finished, and the optimiser's part of it.
 
         Raises:
-            StoreError: The run there is of another method, configuration, seed or data.
+            StoreError: The run there is of another method, configuration, seed or data, its files
+                are damaged, or the checkpoint beside it is not its own.
         """
         path = self.path / checkpoint.TRAINING
         arrays, header = read(path, checkpoint.TRAINING_FORMAT)
-        self._check_same(path, header["header"])
-        checkpoint.load_arrays(self.method, arrays, path, "weights/")
-        state.order.set_state(torch.from_numpy(arrays["generator/order"].copy()))
-        state.noise.set_state(torch.from_numpy(arrays[noise_name(rank)].copy()))
-        state.position = Position(**header["position"])
-        return header["header"]["finished"], arrays if header["optimizer"] else None
+        known = from_json(TrainingHeader, header, f"{path}: header")
+        checkpoint.check_header(known.header, f"{path}: header: header")
+        checkpoint.require_fields(known.header, checkpoint.RUN_FIELDS, path)
+        self._check_same(path, known.header)
+        self._check_position(path, known.position)
+        require(path, ("generator/order", noise_name(rank)), arrays)
+        checkpoint.load_arrays(self.method, arrays, path, NOW)
+        self._check_checkpoint(path, arrays, known.header)
+        try:
+            state.order.set_state(torch.from_numpy(arrays["generator/order"].copy()))
+            state.noise.set_state(torch.from_numpy(arrays[noise_name(rank)].copy()))
+        except (RuntimeError, TypeError) as error:
+            raise StoreError(f"{path}: expected states of generators, found {error}") from error
+        state.position = known.position
+        state.best = {
+            name.removeprefix(BEST): torch.from_numpy(value.copy())
+            for name, value in arrays.items()
+            if name.startswith(BEST)
+        }
+        return known.header["finished"], arrays if known.optimizer else None
+
+    def _check_position(self, path: Path, position: Position) -> None:
+        stages = len(self.method.stages())
+        whole = min(position.epoch, position.step, stages - position.stage) >= 0
+        if not (whole and position.stage >= 0):
+            raise StoreError(
+                f"{path}: header: position: expected one in {stages} stages, found stage "
+                f"{position.stage}, epoch {position.epoch}, step {position.step}"
+            )
+
+    def _check_checkpoint(self, path: Path, arrays: Arrays, training: Header) -> None:
+        """Refuse a checkpoint that was not written with this state, or after it.
+
+        A run that was killed between the two files has the newer checkpoint.
+        """
+        beside = self.path / checkpoint.WEIGHTS
+        if not beside.is_file():
+            return
+        weights, header = checkpoint.read_checkpoint(beside)
+        there, here = moment_of(header), moment_of(training)
+        own = all(header.get(name) == training.get(name) for name in SAME) and there >= here
+        if own and there == here and "moment" in header:
+            names = [name.removeprefix(NOW) for name in arrays if name.startswith(NOW)]
+            own = set(names) == set(weights) and all(
+                np.array_equal(weights[name], arrays[NOW + name]) for name in names
+            )
+        if not own:
+            raise StoreError(
+                f"{beside}: expected the weights that belong to {path.name} (step "
+                f"{training['steps']}), found those of another run or moment (step "
+                f"{header.get('steps')})"
+            )
 
     def _check_same(self, path: Path, found: Header) -> None:
         expected = json.loads(canonical_json(self.header(Position(), finished=False)))
@@ -134,11 +209,12 @@ class RunFolder:
         Args:
             state: Of this rank, the first.
             noises: State of the noise generator of every rank.
-            optimizer: Adam in the middle of a stage.
+            optimizer: In the middle of a stage.
             finished: Whether nothing is left to do.
         """
-        arrays = checkpoint.to_arrays(self.method, "weights/")
-        arrays |= {} if optimizer is None else checkpoint.adam_arrays(optimizer)
+        arrays = checkpoint.to_arrays(self.method, NOW)
+        arrays |= {} if optimizer is None else checkpoint.optimiser_arrays(optimizer)
+        arrays |= {f"{BEST}{name}": checkpoint.array(value) for name, value in state.best.items()}
         arrays["generator/order"] = checkpoint.array(state.order.get_state())
         for rank, noise in enumerate(noises):
             arrays[noise_name(rank)] = checkpoint.array(noise)
@@ -159,6 +235,12 @@ class RunFolder:
         write(self.path / checkpoint.TRAINING, arrays, training)
 
 
+def moment_of(header: Header) -> tuple[int, ...]:
+    """When a file was saved: later ones are greater. Files of before `moment` have steps alone."""
+    finished = int(header.get("finished", False))
+    return (header.get("steps", 0), *header.get("moment", ()), finished)
+
+
 def noise_name(rank: int) -> str:
     """Where the generator of a rank is kept."""
     return f"generator/noise/{rank}" if rank else "generator/noise"
@@ -168,7 +250,8 @@ def kept(run: Path) -> str:
     """What an interrupted run leaves in its folder, in words."""
     path = run / checkpoint.TRAINING
     try:
-        step = read_header(path, checkpoint.TRAINING_FORMAT)["position"]["step"]
+        header = read_header(path, checkpoint.TRAINING_FORMAT)
+        step = from_json(TrainingHeader, header, str(path)).position.step
     except (StoreError, OSError):
         return "nothing was saved yet"
     return f"saved after step {step}, resume continues from there"

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""What `scapo-data` prints while it works and when it is done."""
+"""What `scapo-data` prints while it works and when it is done.
+
+Names and reasons come from files of anybody: they are shown as they are, on one line, never obeyed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -21,10 +23,24 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from scapo.text import one_line
+
 if TYPE_CHECKING:
     from sim_assets.generation.generate import Made
 
 Item = TypeVar("Item")
+
+
+def say(console: Console, line: object, *, label: str = "", style: str = "") -> None:
+    """One line, however long, with a coloured word before it."""
+    text = Text.assemble((f"{label} " if label else "", style), one_line(line))
+    console.print(text, highlight=False, soft_wrap=True)
+
+
+def say_each(console: Console, reasons: Mapping[str, str], *, label: str, style: str) -> None:
+    """One line for each name, with its reason."""
+    for name, reason in reasons.items():
+        say(console, f"{name}: {reason}", label=label, style=style)
 
 
 class RateColumn(ProgressColumn):
@@ -76,17 +92,14 @@ def show_made(console: Console, made: Made, seconds: float) -> None:
     else:
         again = f", {made.kept} shards were there" if made.kept else ""
         how = f"{seconds:.1f} s{again}"
-    lines = [
-        f"{manifest.category}/{manifest.split}: {size}, {how}",
-        f"views redrawn: {100 * facts.get('redrawn_share', 0):.2f} %",
-        f"digest {manifest.digest}",
-        f"plan   {manifest.plan_digest}",
-        f"folder {made.folder}",
-    ]
-    console.print("\n".join(map(escape, lines)), highlight=False, soft_wrap=True)
-    for name, reason in made.failed.items():
-        line = f"[red]left out[/] {escape(name)}: {escape(reason)}"
-        console.print(line, highlight=False, soft_wrap=True)
+    say(console, f"{manifest.category}/{manifest.split}: {size}, {how}")
+    say(console, f"views redrawn: {100 * facts.get('redrawn_share', 0):.2f} %")
+    say(console, f"digest {manifest.digest}")
+    say(console, f"plan   {manifest.plan_digest}")
+    say(console, f"folder {made.folder}")
+    read = {i.id: "; ".join(i.account) for i in manifest.instances if i.account}
+    say_each(console, read, label="taken", style="green")
+    say_each(console, made.failed, label="left out", style="red")
     lost = int(facts.get("samples_lost", 0))
     if lost:
-        console.print(f"{lost} samples were lost with them", highlight=False)
+        say(console, f"{lost} samples were lost with them")

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The verbs of `scapo-data`: one dataclass each, whose fields are the flags.
 
-`scapo-data benchmark`: all data of the benchmark in one command.
-
-The verb `scapo-data import`.
+A verb asks one function of its room, which is imported when it runs, and prints what came of it.
 """
 
 from __future__ import annotations
@@ -11,16 +9,149 @@ from __future__ import annotations
 import os
 import threading
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.markup import escape
 
-from sim_assets.cli.console import progress_bar, show_made, watched
+from scapo.categories import CATEGORIES
+from sim_assets.cli.console import progress_bar, say, say_each, show_made, watched
 from sim_assets.options import DataOptions
+
+if TYPE_CHECKING:
+    CategoryName = str
+else:
+    CategoryName = Literal[tuple(CATEGORIES)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Doctor:
+    """Say which renderers work here, and what supplies those that do not."""
+
+    def run(self, console: Console) -> int:
+        """Print the report; 0 where something renders."""
+        from sim_assets.rendering.doctor import render, report
+
+        found = report(lambda line: say(console, line))
+        console.print(render(found))
+        return 0 if found.backend else 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Build:
+    """Write procedural assets as URDF and OBJ: OUT/CATEGORY/INSTANCE/mobility.urdf."""
+
+    category: tyro.conf.Positional[CategoryName]
+    """Category of the assets."""
+    out: Path
+    """Folder for the assets."""
+    count: int = 10
+    """Number of instances."""
+    seed: int = 1
+    """Seed of the shapes."""
+    split: Literal["train", "val", "test", "test-ood"] = "train"
+    """Split of the instances; splits share none."""
+
+    def run(self, console: Console) -> int:
+        """Write them, and print the folder."""
+        from sim_assets.generation.build import build
+
+        paths = build(
+            self.category, count=self.count, seed=self.seed, out=self.out, split=self.split
+        )
+        written = list(watched(console, "assets", paths, self.count))
+        say(console, f"{len(written)} assets in {self.out / self.category}")
+        return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """Say of each model of a folder whether it can be used: accepted, repaired or refused."""
+
+    path: tyro.conf.Positional[Path]
+    """Folder of models, searched recursively, or one .urdf file."""
+    json: Path | None = None
+    """File that the results are written to as well."""
+    category: CategoryName | None = None
+    """Category that the models must be of; default: some joint can be used."""
+    up: str | None = None
+    """Axis of the URDF's root link that is up, such as z or -y."""
+    front: str | None = None
+    """Axis that the front faces."""
+    scale: float | None = None
+    """Scale: metres per unit of the URDF."""
+    any_model: bool = False
+    """Any model: with a category, accept also those none of whose names speaks of it."""
+    workers: int = os.cpu_count() or 1
+    """Worker processes."""
+
+    def run(self, console: Console) -> int:
+        """Print one line per model; 1 if any is refused."""
+        from sim_assets.inspect.check import Options, Result, check, exit_code, write_report
+
+        colors = {"accepted": "green", "repaired": "yellow", "refused": "red"}
+
+        def show(result: Result) -> None:
+            why = result.reason or "; ".join(result.account or result.repairs)
+            style = colors[result.status]
+            say(console, f"{result.path}  {why}", label=f"{result.status:8} ", style=style)
+
+        options = Options(
+            category=self.category,
+            up=self.up,
+            front=self.front,
+            scale=self.scale,
+            any_model=self.any_model,
+        )
+        results = check(self.path, options, workers=self.workers, on_result=show)
+        if self.json is not None:
+            write_report(results, self.json)
+        counts = {name: sum(r.status == name for r in results) for name in colors}
+        say(console, ", ".join(f"{count} {name}" for name, count in counts.items()))
+        return exit_code(results)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Generate:
+    """Make labelled point clouds: OUT/CATEGORY/SPLIT/manifest.json and shards.
+
+    Started again after an interruption it goes on; the bytes are the same either way.
+    """
+
+    category: tyro.conf.Positional[CategoryName]
+    """Category of the objects."""
+    out: Path
+    """Folder of the data set."""
+    data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
+    workers: int | None = None
+    """Worker processes; by default as many as pay, one per core at most, and one at least for
+    models of a folder. 0: work in this process, unprotected against objects that crash or hang."""
+    engine: Literal["local", "ray"] = "local"
+    """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
+    (docs/cluster.md)."""
+    timeout: float = 300.0
+    """Seconds without a sign of life after which an object counts as hanging and is left out."""
+    strict: bool = False
+    """Stop at the first object that fails."""
+
+    def run(self, console: Console) -> int:
+        """Make them, print a summary, and name the objects that failed."""
+        from sim_assets.generation.generate import Running, make_split
+
+        started = time.monotonic()
+        with progress_bar(console) as show:
+            running = Running(
+                workers=self.workers,
+                engine=self.engine,
+                timeout=self.timeout,
+                strict=self.strict,
+                progress=show,
+            )
+            made = make_split(self.category, self.data, self.out, running)
+        show_made(console, made, time.monotonic() - started)
+        return 1 if made.failed else 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,19 +161,24 @@ class Benchmark:
     Started again after an interruption it goes on; the bytes are the same either way.
     """
 
-    name: tyro.conf.Positional[Literal["sim-art/1"]]
-    """Which one: 69,000 samples of the nine categories, about 1 GB."""
+    name: tyro.conf.Positional[Literal["sim-art/2", "sim-art/1"]]
+    """Name of the benchmark: 117,000 samples of the nine categories, about 1.6 GB
+    (docs/benchmark.md). sim-art/1, its predecessor, is made by an older commit, which is named."""
     out: Path
     """Folder of the benchmark."""
     only: tuple[str, ...] = ()
-    """Make only these: parts (clean, sensor), categories, splits, or several joined by /, such as
-    sensor/laptop/train."""
+    """Only these pieces: parts (clean, sensor, complete, real), categories, splits, or several
+    joined by /, such as sensor/laptop/train."""
+    real: Path | None = None
+    """Real models of yours, PATH/CATEGORY/ID/*.urdf: adds OUT/real/CATEGORY/test, 20 views of each.
+    Their category is told by PATH/index.csv, by themselves, or by the folder."""
     backend: Literal["auto", "sapien", "raycast"] = "sapien"
     """Renderer; the published digests are SAPIEN's."""
     workers: int | None = None
-    """Processes, by default one per core."""
+    """Worker processes; by default as many as pay, one per core at most."""
     engine: Literal["local", "ray"] = "local"
-    """Where they run: on this machine, or on the Ray cluster of RAY_ADDRESS (docs/cluster.md)."""
+    """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
+    (docs/cluster.md)."""
     timeout: float = 300.0
     """Seconds without a sign of life after which an object counts as hanging and is left out."""
     strict: bool = False
@@ -50,10 +186,22 @@ class Benchmark:
 
     def run(self, console: Console) -> int:
         """Make them, print a summary of each split, and name the objects that failed."""
-        from sim_assets.generation.benchmark import RECORD, make_benchmark, pieces
+        from sim_assets.generation.benchmark import (
+            RECORD,
+            Task,
+            check_name,
+            find_real,
+            make_benchmark,
+            pieces,
+        )
         from sim_assets.generation.generate import Running
 
-        total, failed = len(pieces(self.only)), False
+        check_name(self.name)
+        task = Task(only=self.only, backend=self.backend, real=self.real)
+        real = find_real(task)
+        total, failed = len(pieces(self.only, real)), False
+        others = {} if real is None else real.others
+        say_each(console, others, label="no category", style="yellow")
         with progress_bar(console) as show:
             running = Running(
                 workers=self.workers,
@@ -62,12 +210,12 @@ class Benchmark:
                 strict=self.strict,
                 progress=show,
             )
-            made = make_benchmark(self.out, self.only, self.backend, running)
+            made = make_benchmark(self.out, task, running)
             for number, done in enumerate(made, 1):
-                console.print(f"{number}/{total} {done.piece.name}", highlight=False)
+                say(console, f"{number}/{total} {done.piece.name}")
                 show_made(console, done.made, done.seconds)
                 failed |= bool(done.made.failed)
-        console.print(f"recorded in {self.out / RECORD}", soft_wrap=True, highlight=False)
+        say(console, f"recorded in {self.out / RECORD}")
         return 1 if failed else 0
 
 
@@ -82,19 +230,19 @@ class Import:
     name: tyro.conf.Positional[
         Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "partnet-mobility"]
     ]
-    """The set."""
+    """Name of the set."""
     path: tyro.conf.Positional[Path]
-    """Its folder, or one above or within it."""
+    """Folder of the set, or one above or within it."""
     out: Path
     """Folder for what is made."""
     points: int = 1024
-    """Clouds: points of a sample; drawn with replacement where a file has fewer."""
+    """Points of a cloud; drawn with replacement where a file has fewer."""
     strict: bool = False
     """Stop at the first file that cannot be used."""
 
     def run(self, console: Console) -> int:
         """Import it, and name what could not be used; 1 if there is any."""
-        from sim_assets.importers.sets import import_set
+        from sim_assets.importers.sets import Reading, import_set
 
         with progress_bar(console) as show:
             made = import_set(
@@ -103,207 +251,41 @@ class Import:
                 self.out,
                 points=self.points,
                 strict=self.strict,
-                progress=show,
+                reading=Reading(workers=1, progress=show),
             )
-        for model, notes in made.notes.items():
-            line = f"[yellow]repaired[/] {escape(model)}: {escape('; '.join(notes))}"
-            console.print(line, highlight=False, soft_wrap=True)
-        for what, reason in made.refused.items():
-            line = f"[red]left out[/] {escape(what)}: {escape(reason)}"
-            console.print(line, highlight=False, soft_wrap=True)
+        notes = {model: "; ".join(several) for model, several in made.notes.items()}
+        say_each(console, notes, label="repaired", style="yellow")
+        say_each(console, made.refused, label="left out", style="red")
         what = f"{made.samples} clouds in {len(made.written)} splits"
         if not made.samples:
             what = f"{len(made.written)} models"
-        line = f"{what} in {self.out}, {len(made.refused)} left out"
-        console.print(line, highlight=False, soft_wrap=True)
+        say(console, f"{what} in {self.out}, {len(made.refused)} left out")
         return 1 if made.refused or not made.written else 0
-
-
-Name = Literal[
-    "laptop",
-    "safe",
-    "oven",
-    "washer",
-    "eyeglasses",
-    "basket",
-    "drawer",
-    "suitcase",
-    "scissors",
-]
-"""`scapo.CATEGORIES`, written out for the type checker and the help."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Doctor:
-    """Say which renderers work here, and what supplies those that do not."""
-
-    def run(self, console: Console) -> int:
-        """Print the report; 0 where something renders."""
-        from sim_assets.rendering.doctor import render, report
-
-        found = report()
-        console.print(render(found))
-        return 0 if found.backend else 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Build:
-    """Write procedural assets as URDF and OBJ: OUT/CATEGORY/INSTANCE/mobility.urdf."""
-
-    category: tyro.conf.Positional[Name]
-    """What to build."""
-    out: Path
-    """Folder for the assets."""
-    count: int = 10
-    """Number of instances."""
-    seed: int = 1
-    """Of the shapes."""
-    split: Literal["train", "val", "test", "test-ood"] = "train"
-    """Splits share no instance."""
-
-    def run(self, console: Console) -> int:
-        """Write them, and print the folder."""
-        from sim_assets.generation.build import build
-
-        paths = build(
-            self.category, count=self.count, seed=self.seed, out=self.out, split=self.split
-        )
-        written = list(watched(console, "assets", paths, self.count))
-        console.print(f"{len(written)} assets in {self.out / self.category}", soft_wrap=True)
-        return 0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
-    """Say of each model of a folder whether it can be used: accepted, repaired or refused."""
-
-    path: tyro.conf.Positional[Path]
-    """A folder, searched recursively, or one .urdf file."""
-    json: Path | None = None
-    """Write the results to this file as well."""
-    category: Name | None = None
-    """Check as objects of this category; default: that some joint can be used."""
-    up: str | None = None
-    """Which axis of the URDF's root link is up, such as z or -y."""
-    front: str | None = None
-    """Which axis the front faces."""
-    scale: float | None = None
-    """Metres per unit of the URDF."""
-    workers: int = os.cpu_count() or 1
-    """Processes."""
-
-    def run(self, console: Console) -> int:
-        """Print one line per model; 1 if any is refused."""
-        from sim_assets.inspect.check import Options, Result, check, exit_code, write_report
-
-        colors = {"accepted": "green", "repaired": "yellow", "refused": "red"}
-
-        def show(result: Result) -> None:
-            why = result.reason or "; ".join(result.repairs)
-            status = f"[{colors[result.status]}]{result.status:8}[/]"
-            line = f"{status}  {escape(result.path)}  {escape(why)}".rstrip()
-            console.print(line, highlight=False, soft_wrap=True)
-
-        options = Options(category=self.category, up=self.up, front=self.front, scale=self.scale)
-        results = check(self.path, options, workers=self.workers, on_result=show)
-        if self.json is not None:
-            write_report(results, self.json)
-        counts = {name: sum(r.status == name for r in results) for name in colors}
-        console.print(", ".join(f"{count} {name}" for name, count in counts.items()))
-        return exit_code(results)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Generate:
-    """Make labelled point clouds: OUT/CATEGORY/SPLIT/manifest.json and shards.
-
-    Started again after an interruption it goes on; the bytes are the same either way.
-    """
-
-    category: tyro.conf.Positional[Name]
-    """What to show."""
-    out: Path
-    """Folder of the data set."""
-    data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
-    workers: int | None = None
-    """Processes, by default one per core; 0: work in this one, unprotected against objects that
-    crash or hang."""
-    engine: Literal["local", "ray"] = "local"
-    """Where they run: on this machine, or on the Ray cluster of RAY_ADDRESS (docs/cluster.md)."""
-    timeout: float = 300.0
-    """Seconds without a sign of life after which an object counts as hanging and is left out."""
-    strict: bool = False
-    """Stop at the first object that fails."""
-
-    def run(self, console: Console) -> int:
-        """Make them, print a summary, and name the objects that failed."""
-        from sim_assets.generation.generate import Running, generate
-        from sim_assets.generation.request import make_request, versions
-
-        started = time.monotonic()
-        source = self.data.source
-        if source != "procedural":  # workers elsewhere stand in another folder
-            source = str(Path(source).absolute())
-        request, assets = make_request(self.category, replace(self.data, source=source))
-        folder = self.out / self.category / self.data.split
-        with progress_bar(console) as show:
-            made = generate(
-                request,
-                assets,
-                folder,
-                versions(request.settings.backend, request.settings.protocol),
-                Running(
-                    workers=self.workers,
-                    engine=self.engine,
-                    timeout=self.timeout,
-                    strict=self.strict,
-                    progress=show,
-                ),
-            )
-        show_made(console, made, time.monotonic() - started)
-        return 1 if made.failed else 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Info:
-    """Say what a data set holds, and whether its shards are whole."""
+    """Say what a data set holds, how much its objects differ, and whether its shards are whole."""
 
     path: tyro.conf.Positional[Path]
     """A data set, or a category or split of one."""
+    source: Path | None = None
+    """Source of the objects: the folder of models that the set was made from, to measure them."""
 
     def run(self, console: Console) -> int:
         """Print counts, histograms and digests of every split; 1 if a shard is damaged."""
-        from sim_assets.describe.info import describe_folder
+        from scapo.store import Split
+        from sim_assets.describe.info import describe_split, find_splits
+        from sim_assets.inspect.variation import Variation
 
-        whole = True
-        for report in describe_folder(self.path):
-            console.print(report.text, soft_wrap=True, highlight=False, markup=False)
+        whole, variation = True, Variation(self.source)
+        for folder in find_splits(self.path):
+            split = Split(folder)
+            report = describe_split(split)
+            lines = [report.text, *variation.lines(split)]
+            console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
             whole &= report.whole
         return 0 if whole else 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Preview:
-    """Draw samples of a data set as one picture: clouds by part, with joint axes."""
-
-    path: tyro.conf.Positional[Path]
-    """A data set, or a category or split of one."""
-    out: Path
-    """The picture, FILE.png."""
-    count: int = 24
-    """Samples, spread over each split."""
-    category: Name | None = None
-    """Only this one."""
-    split: str | None = None
-    """Only this one."""
-
-    def run(self, console: Console) -> int:
-        """Draw it."""
-        from sim_assets.inspect.preview import draw_preview
-
-        drawn = draw_preview(self.path, self.out, self.count, self.category, self.split)
-        console.print(f"{drawn} samples drawn in {self.out}", soft_wrap=True)
-        return 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -313,7 +295,7 @@ class View:
     path: tyro.conf.Positional[Path]
     """A data set, or a category or split of one."""
     port: int = 8080
-    """To listen at; the next free one is taken if it is in use."""
+    """Port to listen at; the next free one is taken if it is in use."""
     host: str = "localhost"
     """Address to listen at; 0.0.0.0 lets other machines in."""
     source: Path | None = None
@@ -325,12 +307,73 @@ class View:
 
         viewer = Viewer(self.path, self.source, self.host, self.port)
         try:
-            console.print(f"{viewer.url} (Ctrl-C ends it)", highlight=False, soft_wrap=True)
+            say(console, f"{viewer.url} (Ctrl-C ends it)")
             threading.Event().wait()
         except KeyboardInterrupt:
-            console.print("ended")
+            say(console, "ended")
         finally:
             viewer.close()
+        return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preview:
+    """Draw samples of a data set as one picture: clouds by part, with joint axes."""
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+    out: Path
+    """File of the picture, FILE.png."""
+    count: int = 24
+    """Number of samples of each split, spread evenly."""
+    category: CategoryName | None = None
+    """Category to draw; default: all."""
+    split: str | None = None
+    """Split to draw; default: all."""
+    by_ambiguity: bool = False
+    """Draw half of them of samples that look alike under other turns, half of others, apart; for
+    data made with --ambiguity."""
+
+    def run(self, console: Console) -> int:
+        """Draw it."""
+        from sim_assets.inspect.preview import draw_preview
+
+        drawn = draw_preview(
+            self.path,
+            self.out,
+            self.count,
+            self.category,
+            self.split,
+            by_ambiguity=self.by_ambiguity,
+        )
+        say(console, f"{drawn} samples drawn in {self.out}")
+        return 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Write a data set in a format that is read without this package.
+
+    OUT gets the same folders, with the manifest, the card and a file for each shard. It appears
+    whole, and replaces only an earlier export.
+    """
+
+    path: tyro.conf.Positional[Path]
+    """A data set, or a category or split of one."""
+    format: Literal["webdataset", "parquet", "npz"]
+    """Format. webdataset: tar files with one .npy for each tensor of a sample. parquet: a row for
+    each sample (needs pyarrow: pip install 'scapo[export]'). npz: stacked arrays."""
+    out: Path
+    """Folder to write."""
+
+    def run(self, console: Console) -> int:
+        """Write it, and print what was written."""
+        from sim_assets.describe.info import find_splits
+        from sim_assets.formats.export import export
+
+        for done in export(self.path, find_splits(self.path), self.out, self.format):
+            say(console, f"{done.name}: {done.samples} samples in {done.files} files")
+        say(console, f"written to {self.out}")
         return 0
 
 
@@ -344,5 +387,6 @@ VERBS: dict[str, type] = {
     "info": Info,
     "view": View,
     "preview": Preview,
+    "export": Export,
 }
 """In the order of the help."""

@@ -13,22 +13,13 @@ from pathlib import Path
 from scapo.geometry.camera import Intrinsics
 from scapo.store import Split, write_bytes
 from scapo.store.manifest import Manifest
+from scapo.text import as_markdown
+from sim_assets.describe.croissant import CROISSANT, croissant_text
 from sim_assets.describe.info import histograms
+from sim_assets.describe.terms import citation, licence, terms
 from sim_assets.sampling.presets import camera
 
 CARD = "card.md"
-_OWN_TERMS = (
-    "The objects are made by this project's own generators and show nobody's design; the data may "
-    "be used under the project's licence (MIT)."
-)
-_MODELS_TERMS = (
-    "Rendered from models in a folder of URDF files. The terms of those models apply to this data "
-    "as well; the manifest names the file and the SHA-256 of each."
-)
-_FOREIGN_TERMS = (
-    "Converted from other authors' set `{source}`. Their terms apply to this data, and their work "
-    "is to be cited; the manifest names the files and the SHA-256 of each recording."
-)
 _READ = """```python
 from scapo.store import dataset
 
@@ -38,23 +29,29 @@ samples[0]["points"]  # ({points}, 3), camera frame, metres
 
 
 def write_card(folder: Path) -> None:
-    """Write the card of the split in this folder.
+    """Write the card of the split in this folder, and its Croissant file.
 
     Raises:
         StoreError: There is no split, or a shard is broken.
         OSError: It cannot be written.
     """
-    write_bytes(folder / CARD, card(Split(folder)).encode())
+    split = Split(folder)
+    for name, text in ((CROISSANT, croissant_text(split)), (CARD, card(split))):
+        path, data = folder / name, text.encode()
+        if not path.exists() or path.read_bytes() != data:
+            write_bytes(path, data)
 
 
 def card(split: Split) -> str:
     """The card as Markdown."""
     manifest = split.manifest
     sections = [
-        f"# {manifest.category}, {manifest.split}",
-        _summary(manifest),
+        as_markdown(f"# {manifest.category}, {manifest.split}"),
+        _summary(split),
         "## Source and terms",
-        _terms(manifest),
+        terms(manifest),
+        "## How to cite",
+        f"```bibtex\n{citation(manifest)}\n```",
         "## How it was made",
         _made(manifest),
         "## Parts and joints",
@@ -62,7 +59,7 @@ def card(split: Split) -> str:
         "## States, views and points",
         "Least value, distribution, greatest value and mean over the samples. Azimuth and "
         "elevation are those of the camera about the object's front.",
-        "```\n" + "\n".join(line.strip() for line in histograms(split)) + "\n```",
+        "```\n" + "\n".join(line.replace("`", "'") for line in histograms(split)) + "\n```",
         "## How to read it",
         "Points and labels are in the camera frame (x right, y down, z forward), metres and "
         "radians; `part` 255 is background. `manifest.json` has frames, sources and digests.",
@@ -71,8 +68,12 @@ def card(split: Split) -> str:
     return "\n\n".join(sections) + "\n"
 
 
-def _summary(manifest: Manifest) -> str:
+def _summary(split: Split) -> str:
+    manifest = split.manifest
+    size = sum((split.folder / shard.file).stat().st_size for shard in manifest.shards)
     rows = [
+        ("licence", licence(manifest)),
+        ("size", f"{size / 1e6:.1f} MB"),
         ("samples", f"{manifest.count}"),
         ("points per sample", f"{manifest.points}"),
         ("objects", f"{len(manifest.instances)}"),
@@ -95,13 +96,6 @@ def _summary(manifest: Manifest) -> str:
     return _table(("", ""), rows)
 
 
-def _terms(manifest: Manifest) -> str:
-    source = manifest.options.get("source")
-    if source == "procedural":
-        return _OWN_TERMS
-    return _MODELS_TERMS if source == "urdf" else _FOREIGN_TERMS.format(source=source)
-
-
 def _made(manifest: Manifest) -> str:
     told = {
         n: value for n, value in sorted(manifest.options.items()) if not isinstance(value, dict)
@@ -111,6 +105,9 @@ def _made(manifest: Manifest) -> str:
     if isinstance(seen, dict):
         size = f"{seen['width']} x {seen['height']}"
         rows.append(("camera", f"{size}, fx {seen['fx']:.6g}, fy {seen['fy']:.6g}"))
+    alike = manifest.options.get("ambiguity")
+    if isinstance(alike, dict):
+        rows.append(("ambiguity", ", ".join(f"{k} {v:g}" for k, v in sorted(alike.items()))))
     rows += [(f"version of {name}", text) for name, text in sorted(manifest.versions.items())]
     table = _table(("option", "value"), rows)
     command = remake(manifest)
@@ -122,6 +119,8 @@ def remake(manifest: Manifest) -> str | None:
     options = manifest.options
     if options.get("source") not in ("procedural", "urdf") or "camera" not in options:
         return None
+    if "chosen_by" in options:
+        return f"scapo-data {options['chosen_by']} FOLDER --only real/{manifest.category} --out OUT"
     source = "FOLDER" if options["source"] == "urdf" else "procedural"
     flags = {"source": source, "split": manifest.split, "count": manifest.count}
     if manifest.statistics.get("samples_lost"):
@@ -133,7 +132,8 @@ def remake(manifest: Manifest) -> str | None:
     if Intrinsics(**options["camera"]) != usual:
         flags["image_size"] = options["camera"]["width"]
     words = [f"--{name.replace('_', '-')} {value}" for name, value in flags.items()]
-    words += ["--color"] if options.get("color") else []
+    switches = ("color", "ambiguity", "any_model")
+    words += [f"--{name.replace('_', '-')}" for name in switches if options.get(name)]
     return f"scapo-data generate {manifest.category} --out OUT {' '.join(words)}"
 
 
@@ -144,10 +144,10 @@ def _joints(manifest: Manifest) -> str:
         travel = f"{joint.lower * factor:.4g} to {joint.upper * factor:.4g} {unit}"
         ends = f"{manifest.parts[joint.parent]} to {manifest.parts[joint.child]}"
         rows.append((f"{number}", joint.kind, ends, travel))
-    parts = ", ".join(f"{number} {name}" for number, name in enumerate(manifest.parts))
+    parts = ", ".join(f"{number} {as_markdown(p)}" for number, p in enumerate(manifest.parts))
     return f"Parts: {parts}.\n\n" + _table(("joint", "kind", "links", "travel"), rows)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(map(as_markdown, line))} |" for line in lines)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +13,12 @@ from jaxtyping import Float
 
 from scapo.store import Split, StoreError
 from scapo.store.manifest import Manifest
+from scapo.text import one_line
 from sim_assets.sampling.viewpoints import direction_angles
 
 BARS = " ▁▂▃▄▅▆▇█"
 BINS = 24
+LONGEST_NAME = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,26 +42,16 @@ def find_splits(path: Path) -> list[Path]:
     return found
 
 
-def describe_folder(path: Path) -> Iterator[Report]:
-    """A report for each split at `path` or below it.
-
-    Raises:
-        StoreError: There is no data set, or a manifest is broken.
-    """
-    for folder in find_splits(path):
-        yield describe_split(Split(folder))
-
-
 def describe_split(split: Split) -> Report:
     """The report of one split; its shards are read, and compared with their hashes."""
     manifest = split.manifest
-    lines = [f"{split.folder}", *_facts(manifest)]
+    lines = [one_line(split.folder), *map(_line, _facts(manifest))]
     try:
         split.verify()
-        lines += histograms(split)
+        lines += map(_line, histograms(split))
         lines.append(f"  shards     {len(manifest.shards)}, all whole")
     except StoreError as error:
-        return Report(text="\n".join([*lines, f"  DAMAGED    {error}"]), whole=False)
+        return Report(text="\n".join([*lines, _line(f"DAMAGED    {error}")]), whole=False)
     return Report(text="\n".join(lines), whole=True)
 
 
@@ -68,20 +60,23 @@ def _facts(manifest: Manifest) -> list[str]:
     told = ("protocol", "preset", "noise", "mask", "backend", "sampling", "source")
     how = ", ".join(f"{name} {options[name]}" for name in told if options.get(name) is not None)
     lines = [
-        f"  category   {manifest.category} ({', '.join(manifest.parts)}), split {manifest.split}",
-        f"  samples    {manifest.count} of {manifest.points} points, "
+        f"category   {manifest.category} ({', '.join(manifest.parts)}), split {manifest.split}",
+        f"samples    {manifest.count} of {manifest.points} points, "
         f"{len(manifest.instances)} objects, seed {manifest.seed}",
-        f"  options    {how}",
-        "  versions   " + ", ".join(f"{k} {v}" for k, v in sorted(manifest.versions.items())),
-        f"  digest     {manifest.digest}",
-        f"  plan       {manifest.plan_digest}",
+        f"options    {how}",
+        "versions   " + ", ".join(f"{k} {v}" for k, v in sorted(manifest.versions.items())),
+        f"digest     {manifest.digest}",
+        f"plan       {manifest.plan_digest}",
     ]
+    traits = Counter(instance.trait for instance in manifest.instances if instance.trait)
+    if traits:
+        lines.append("  traits     " + ", ".join(f"{n} {name}" for name, n in traits.items()))
     facts = manifest.statistics
     if "redrawn_share" in facts:
-        lines.append(f"  redrawn    {100 * facts['redrawn_share']:.2f} % of the views drawn")
+        lines.append(f"redrawn    {100 * facts['redrawn_share']:.2f} % of the views drawn")
     if facts.get("samples_lost") or facts.get("objects_refused"):
         lines.append(
-            f"  left out   {facts.get('objects_refused', 0):.0f} objects refused, "
+            f"left out   {facts.get('objects_refused', 0):.0f} objects refused, "
             f"{facts.get('objects_failed', 0):.0f} failed, "
             f"{facts.get('samples_lost', 0):.0f} samples lost"
         )
@@ -106,11 +101,27 @@ def histograms(split: Split) -> list[str]:
     lines.append(histogram("distance", np.linalg.norm(eye, axis=-1), "m"))
     for p, name in enumerate(manifest.parts):
         share = 100 * (data["part"] == p).mean(-1)
-        lines.append(histogram(f"points on {name}", share, "%"))
-        lines.append(histogram(f"{name} visible", 100 * data["visible"][:, p], "%"))
+        short = one_line(name, LONGEST_NAME)
+        lines.append(histogram(f"points on {short}", share, "%"))
+        lines.append(histogram(f"{short} visible", 100 * data["visible"][:, p], "%"))
+    if "ambiguity" in manifest.options:
+        lines.append(_ambiguous(split))
     per_object = np.bincount(data["instance"], minlength=len(manifest.instances))
-    lines.append(f"  per object {per_object.min()} to {per_object.max()} samples")
+    lines.append(f"per object {per_object.min()} to {per_object.max()} samples")
     return lines
+
+
+def _ambiguous(split: Split) -> str:
+    alike = split.arrays("alike")["alike"] == 1
+    several = alike[:, 1:].any(1)
+    turns = np.flatnonzero(alike[:, 1:].any(0)) + 1
+    which = f", turns {', '.join(map(str, turns))}" if len(turns) else ""
+    return f"ambiguous  {100 * several.mean():.1f} % of the views look alike when turned{which}"
+
+
+def _line(text: str) -> str:
+    """Indented, and on one line whatever names the manifest has."""
+    return f"  {one_line(text)}"
 
 
 def describe_state(state: float, kind: str) -> str:
@@ -124,10 +135,10 @@ def histogram(name: str, values: Float[np.ndarray, " K"], unit: str) -> str:
     """One line: name, least value, bars, greatest value and unit, mean; of the known values."""
     values = values[~np.isnan(values)]
     if not len(values):
-        return f"  {name:22} unknown"
+        return f"{name:22} unknown"
     low, high = float(values.min()), float(values.max())
     counts, _ = np.histogram(values, bins=BINS, range=(low, high if high > low else low + 1))
     level = np.ceil(counts / counts.max() * (len(BARS) - 1)).astype(int)
     bars = "".join(BARS[i] for i in level)
     mean = f"mean {values.mean():.4g}"
-    return f"  {name:22} {low:9.4g} {bars} {high:.4g} {unit}, {mean}"
+    return f"{name:22} {low:9.4g} {bars} {high:.4g} {unit}, {mean}"

@@ -7,6 +7,7 @@ by name.
 
 from __future__ import annotations
 
+import errno
 import io
 import math
 import zipfile
@@ -17,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from sim_assets.formats.pickled import STORAGES, Admitted, Storage
+from scapo.store.regular import read_regular
+from sim_assets.formats.pickled import STORAGES, Admitted, Storage, shown
 from sim_assets.formats.unpickle import UnpickleError, unpickle
 
 MAX_BYTES = 1 << 30
@@ -31,11 +33,12 @@ def read_bytes(path: Path) -> bytes:
         UnpickleError: No such file, unreadable, or too large.
     """
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise UnpickleError(f"{path}: expected at most {MAX_BYTES >> 20} MiB, found {size}")
-        return path.read_bytes()
+        return read_regular(path, MAX_BYTES)
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise UnpickleError(
+                f"{path}: expected at most {MAX_BYTES >> 20} MiB, found more"
+            ) from error
         raise UnpickleError(f"{path}: expected a readable file, found {error.strerror}") from error
 
 
@@ -88,9 +91,11 @@ def read_pt(path: Path, data: bytes | None = None) -> Any:  # noqa: ANN401
     def storage(key: tuple[Any, ...]) -> Storage:
         """('storage', class, name of the member, device, number of elements)."""
         if len(key) != 5 or key[0] != "storage" or not isinstance(key[1], Admitted):
-            raise UnpickleError(f"expected a storage, found {key!r:.80}")
+            raise UnpickleError(f"expected a storage, found {shown(key)}")
         if key[1].name not in STORAGES:
             raise UnpickleError(f"expected a plain storage, found {key[1].name}")
+        if not isinstance(key[2], str):
+            raise UnpickleError(f"expected the name of a storage, found {shown(key[2])}")
         member = f"{folder}data/{key[2]}"
         if member not in members:
             raise UnpickleError(f"expected the storage {member!r}, found none")
@@ -109,6 +114,8 @@ def _npy(raw: bytes, where: object) -> Any:  # noqa: ANN401
         header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
         shape, _, dtype = header(file)
         if not dtype.hasobject:
+            if dtype.itemsize == 0:
+                raise ValueError(f"elements of {dtype}, which have no bytes")
             if math.prod(shape) * dtype.itemsize > len(raw):
                 raise ValueError(f"{len(raw)} bytes for the shape {shape} of {dtype}")
             file.seek(0)

@@ -10,21 +10,32 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 MAX_ELEMENTS = 1 << 28
 """Of one array: 100 times a 640 x 480 cloud with colours."""
+MAX_REPEATED = 1 << 16
+"""Elements of a tensor that shows those of a smaller storage again and again."""
 MAX_DEPTH = 64
 """Of containers within containers."""
+MAX_CONTENTS = 20_000_000
+"""Opcodes, and values when those that appear in many places are counted in each: a label for each
+triangle of a large mesh takes a few."""
 _DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}|O8?|\?|bool)")
 
 
 class UnpickleError(ValueError):
     """A pickle holds more than data, or is damaged: `file: expected, found`."""
+
+
+def shown(value: object) -> str:
+    """A value for a message; its `repr` may be longer than the memory, however short its pickle."""
+    return reprlib.repr(value)[:80]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,16 +61,16 @@ class Dtype(Buildable):
     def __init__(self, text: object, *_: object) -> None:
         """Only numbers, text, bytes and objects; no structures, times or voids."""
         if not isinstance(text, str) or not _DTYPE.fullmatch(text):
-            raise UnpickleError(f"expected a plain dtype, found {text!r:.80}")
+            raise UnpickleError(f"expected a plain dtype, found {shown(text)}")
         self.dtype = np.dtype(text)
 
     def build(self, state: object) -> None:
         """(version, byte order, subarray, names, fields, ...): all but the order must be empty."""
         if not isinstance(state, tuple) or len(state) < 5 or any(state[2:5]):
-            raise UnpickleError(f"expected the state of a plain dtype, found {state!r:.80}")
+            raise UnpickleError(f"expected the state of a plain dtype, found {shown(state)}")
         order = state[1]
         if order not in ("<", ">", "=", "|"):
-            raise UnpickleError(f"expected a byte order, found {order!r:.80}")
+            raise UnpickleError(f"expected a byte order, found {shown(order)}")
         if order in ("<", ">"):
             self.dtype = self.dtype.newbyteorder(order)
 
@@ -76,7 +87,7 @@ class Array(Buildable):
     def build(self, state: object) -> None:
         """(version, shape, dtype, Fortran order, bytes or list)."""
         if not isinstance(state, tuple) or len(state) != 5:
-            raise UnpickleError(f"expected the state of an array, found {state!r:.80}")
+            raise UnpickleError(f"expected the state of an array, found {shown(state)}")
         _, shape, dtype, fortran, data = state
         if not isinstance(dtype, Dtype):
             raise UnpickleError(f"expected a dtype, found {type(dtype).__name__}")
@@ -117,14 +128,14 @@ def _counts(values: object) -> tuple[int, ...]:
     given = values if isinstance(values, tuple) else (values,)
     counts = tuple(count for count in given if isinstance(count, int) and count >= 0)
     if len(counts) != len(given) or len(counts) > 32:
-        raise UnpickleError(f"expected the shape of an array, found {values!r:.80}")
+        raise UnpickleError(f"expected the shape of an array, found {shown(values)}")
     return counts
 
 
 def _shape(shape: object) -> tuple[int, ...]:
     sizes = _counts(shape)
     if math.prod(sizes) > MAX_ELEMENTS:
-        raise UnpickleError(f"expected at most {MAX_ELEMENTS} elements, found shape {sizes}")
+        raise UnpickleError(f"expected at most {MAX_ELEMENTS} elements, found {shown(sizes)}")
     return sizes
 
 
@@ -143,14 +154,14 @@ def _filled(data: object, dtype: Dtype, shape: object, order: Any) -> np.ndarray
 
 def _reconstruct(kind: object, *_: object) -> Array:
     if not isinstance(kind, Admitted) or kind.name != "numpy.ndarray":
-        raise UnpickleError(f"expected an array of class numpy.ndarray, found {kind!r:.80}")
+        raise UnpickleError(f"expected an array of class numpy.ndarray, found {shown(kind)}")
     return Array()
 
 
 def _from_buffer(data: object, dtype: object, shape: object, order: object) -> np.ndarray:
     """Protocol 5 of numpy, the bytes within the pickle."""
     if not isinstance(dtype, Dtype) or dtype.dtype.kind == "O" or order not in ("C", "F"):
-        raise UnpickleError(f"expected a plain dtype and order C or F, found {order!r:.20}")
+        raise UnpickleError(f"expected a plain dtype and order C or F, found {shown(order)}")
     return _filled(data, dtype, shape, order)
 
 
@@ -163,7 +174,7 @@ def _scalar(dtype: object, data: object = b"") -> Any:  # noqa: ANN401
 def _encode(text: object, encoding: object = "latin1") -> bytes:
     """How protocol 2 of Python 3 stores bytes."""
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-        raise UnpickleError(f"expected bytes as latin-1 text, found {encoding!r:.80}")
+        raise UnpickleError(f"expected bytes as latin-1 text, found {shown(encoding)}")
     return text.encode("latin-1")
 
 
@@ -182,6 +193,9 @@ def _tensor(storage: object, offset: object, size: object, stride: object, *_: o
     dtype = np.dtype(STORAGES[storage.name])
     base = np.frombuffer(storage.data, dtype, len(storage.data) // dtype.itemsize)
     last = offset + sum((n - 1) * step for n, step in zip(sizes, steps, strict=True))
+    if math.prod(sizes) > max(len(base), MAX_REPEATED):
+        expected = f"at most the {len(base)} elements of its storage"
+        raise UnpickleError(f"expected {expected} in a tensor, found shape {sizes}")
     if math.prod(sizes) == 0:
         array = np.zeros(sizes, dtype)
     elif offset < 0 or last >= len(base):
@@ -202,9 +216,16 @@ def _contents(kind: type[Any]) -> Callable[..., Any]:
     def make(*values: object) -> Any:  # noqa: ANN401
         if len(values) > 1 or not all(isinstance(v, list | tuple | set) for v in values):
             raise UnpickleError(f"expected the items of a {kind.__name__}")
-        return kind(*values)
+        items = cast("list[Any]", list(*values))
+        return kind(map(_checked_pair if kind is dict else check_key, items))
 
     return make
+
+
+def _checked_pair(item: Any) -> Any:  # noqa: ANN401
+    if not isinstance(item, list | tuple) or len(item) != 2:
+        raise UnpickleError(f"expected pairs of key and value, found {shown(item)}")
+    return check_key(item[0]), item[1]
 
 
 _MAKERS: dict[str, Callable[..., Any]] = {
@@ -242,29 +263,37 @@ class _Resolver:
     """Finishes each object once."""
 
     def __init__(self) -> None:
-        self.done: dict[int, Any] = {}
+        self.done: dict[int, tuple[Any, int]] = {}
+        """By identity: the finished value, and how many values it is with all that it holds."""
         self.open: set[int] = set()
+        self.count = 0
 
     def resolve(self, value: Any, depth: int) -> Any:  # noqa: ANN401
+        self.count += 1
+        if self.count > MAX_CONTENTS:  # a few lists that hold one another many times
+            raise UnpickleError(f"expected at most {MAX_CONTENTS} values, found more")
         if not isinstance(value, list | tuple | dict | set | frozenset | Array):
             return _plain(value)
         if id(value) in self.done:
-            return self.done[id(value)]
+            result, size = self.done[id(value)]
+            self.count += size - 1
+            return result
         if id(value) in self.open or depth > MAX_DEPTH:
             raise UnpickleError(f"expected data at most {MAX_DEPTH} levels deep, found deeper data")
         self.open.add(id(value))
+        before = self.count - 1
         result = self._finished(value, depth + 1)
         self.open.discard(id(value))
-        self.done[id(value)] = result
+        self.done[id(value)] = result, self.count - before
         return result
 
     def _finished(self, value: Any, depth: int) -> Any:  # noqa: ANN401
         if isinstance(value, Array):
             return self._array(value, depth)
         if isinstance(value, dict):
-            return {_key(k): self.resolve(item, depth) for k, item in value.items()}
+            return {check_key(k): self.resolve(item, depth) for k, item in value.items()}
         if isinstance(value, set | frozenset):
-            return type(value)(_key(item) for item in value)
+            return type(value)(check_key(item) for item in value)
         return type(value)(self.resolve(item, depth) for item in value)
 
     def _array(self, value: Array, depth: int) -> np.ndarray:
@@ -285,8 +314,14 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
     raise UnpickleError(f"expected data, found {named} itself")
 
 
-def _key(value: Any) -> Any:  # noqa: ANN401
-    """A key or an item of a set: numbers and text only."""
+def check_key(value: Any) -> Any:  # noqa: ANN401
+    """A key or an item of a set: numbers and text only.
+
+    To be asked before it is hashed: tuples of tuples may take for ever.
+
+    Raises:
+        UnpickleError: It is something else.
+    """
     if isinstance(value, str | bytes | int | float | np.generic | None):
         return value
     raise UnpickleError(f"expected numbers or text as keys, found {type(value).__name__}")

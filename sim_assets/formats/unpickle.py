@@ -16,12 +16,20 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-from sim_assets.formats.pickled import ADMITTED, Admitted, Buildable, UnpickleError, resolve
+from scapo.text import one_line
+from sim_assets.formats.pickled import (
+    ADMITTED,
+    MAX_CONTENTS,
+    Admitted,
+    Buildable,
+    UnpickleError,
+    check_key,
+    resolve,
+    shown,
+)
 
 __all__ = ["UnpickleError", "unpickle"]
 
-MAX_CONTENTS = 20_000_000
-"""Opcodes; a label for each triangle of a large mesh takes a few."""
 Persistent = Callable[[tuple[Any, ...]], Any]
 
 _NUMBERS = ("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT")
@@ -55,9 +63,11 @@ def unpickle(data: bytes, where: object, persistent: Persistent | None = None) -
     try:
         return resolve(machine.run(data))
     except UnpickleError as error:
-        raise UnpickleError(f"{where}: {error}") from error
+        raise UnpickleError(f"{where}: {one_line(error, 400)}") from error
     except (ValueError, TypeError, LookupError, struct.error, OverflowError) as error:
-        raise UnpickleError(f"{where}: expected a whole pickle, found {error}") from error
+        raise UnpickleError(
+            f"{where}: expected a whole pickle, found {one_line(error, 400)}"
+        ) from error
     except (MemoryError, RecursionError) as error:
         raise UnpickleError(f"{where}: expected a pickle of sane size, found {error!r}") from error
 
@@ -146,7 +156,7 @@ class _Machine:
         self.stack.append(_pairs(self._since_mark()))
 
     def new_frozenset(self, _: object) -> None:
-        self.stack.append(frozenset(self._since_mark()))
+        self.stack.append(frozenset(map(check_key, self._since_mark())))
 
     def append(self, _: object) -> None:
         (value,) = self._last(1)
@@ -166,7 +176,7 @@ class _Machine:
 
     def add_items(self, _: object) -> None:
         values = self._since_mark()
-        _expect(self._top(), set).update(values)
+        _expect(self._top(), set).update(map(check_key, values))
 
     def name(self, argument: Any) -> None:  # noqa: ANN401
         self._admit(*str(argument).split(" ", 1))
@@ -193,7 +203,7 @@ class _Machine:
     def persistent_id(self, _: object) -> None:
         (key,) = self._last(1)
         if self.persistent is None:
-            raise UnpickleError(f"expected no persistent id, found {key!r:.80}")
+            raise UnpickleError(f"expected no persistent id, found {shown(key)}")
         self.stack.append(self.persistent(_expect(key, tuple)))
 
 
@@ -232,4 +242,4 @@ def _expect(value: Any, kind: type[Any]) -> Any:  # noqa: ANN401
 def _pairs(values: list[Any]) -> dict[Any, Any]:
     if len(values) % 2:
         raise UnpickleError("expected pairs of key and value, found an odd number")
-    return dict(zip(values[::2], values[1::2], strict=True))
+    return dict(zip(map(check_key, values[::2]), values[1::2], strict=True))

@@ -12,9 +12,11 @@ from typing import Protocol, runtime_checkable
 
 from scapo.store.manifest import Instance, Manifest
 from sim_assets import procedural
+from sim_assets.models.account import check_speaks
 from sim_assets.models.library import source_root
 from sim_assets.models.reader import find, instance_id, read, select
 from sim_assets.objects import ArticulatedObject
+from sim_assets.options import DataOptions
 
 
 @runtime_checkable
@@ -68,6 +70,8 @@ class UrdfAsset:
     """Which axis the front faces; None: as the source says, or told from the joint."""
     scale: float | None = None
     """Metres per unit of the URDF; None: as the source says."""
+    any_model: bool = False
+    """Whether a model that does not speak of the category is taken too."""
 
     @property
     def name(self) -> str:
@@ -80,7 +84,7 @@ class UrdfAsset:
         Raises:
             AssetError: It cannot be used, and why.
         """
-        return read(
+        thing = read(
             self.urdf,
             self.category,
             up=self.up,
@@ -88,6 +92,9 @@ class UrdfAsset:
             scale=self.scale,
             root=self.root,
         )
+        if not self.any_model:
+            check_speaks(self.urdf, thing)
+        return thing
 
 
 def procedural_assets(category: str, split: str, seed: int, count: int) -> list[Asset]:
@@ -103,24 +110,25 @@ def procedural_assets(category: str, split: str, seed: int, count: int) -> list[
     ]
 
 
-def folder_assets(
-    source: Path,
-    category: str,
-    split: str,
-    *,
-    up: str | None = None,
-    front: str | None = None,
-    scale: float | None = None,
-) -> list[Asset]:
-    """The models of a folder that belong to a split.
+def folder_assets(category: str, options: DataOptions) -> list[Asset]:
+    """The models of the folder `options.source` that belong to the split, read as options say.
 
     Raises:
         AssetError: No such folder, or no model of this split in it.
     """
+    source = Path(options.source)
     root = source_root(source)
     return [
-        UrdfAsset(urdf=urdf, root=root, category=category, up=up, front=front, scale=scale)
-        for urdf in select(find(source), split, root)
+        UrdfAsset(
+            urdf=urdf,
+            root=root,
+            category=category,
+            up=options.up,
+            front=options.front,
+            scale=options.scale,
+            any_model=options.any_model,
+        )
+        for urdf in select(find(source), options.split, root)
     ]
 
 
@@ -182,5 +190,6 @@ def _asset(manifest: Manifest, instance: Instance, source: Path | None) -> Asset
             up=options.get("up"),
             front=options.get("front"),
             scale=options.get("scale"),
+            any_model=True,  # it was taken then
         )
     raise RecoverError(f"{instance.id}: expected procedural objects or URDF models, found {kind}")

@@ -28,6 +28,7 @@ from sim_assets.generation.plan import (
     samples_per_instance,
     used_instances,
 )
+from sim_assets.generation.request import make_request, versions
 from sim_assets.generation.shard import (
     TOGETHER,
     ShardDone,
@@ -36,6 +37,8 @@ from sim_assets.generation.shard import (
     render_shard,
     render_shard_alike,
 )
+from sim_assets.generation.workers import planned_workers
+from sim_assets.options import DataOptions
 
 Progress = Callable[[str, int, int], None]
 
@@ -49,7 +52,7 @@ class Running:
     """How a split is made: nothing here changes its bytes."""
 
     workers: int | None = 1
-    """None: one per core, of this machine or of the cluster."""
+    """None: as many as pay on this machine (`planned_workers`); of a cluster one per core."""
     engine: Engine = "local"
     timeout: float = 300.0
     """Seconds without a sign of life after which an object counts as hanging."""
@@ -71,13 +74,33 @@ class Made:
     """Shards that were there already."""
 
 
-def open_workers(running: Running) -> AbstractPool[Any, Any]:
-    """The workers that do it, as a context manager.
+def open_workers(running: Running, *requests: Request) -> AbstractPool[Any, Any]:
+    """The workers that make these requests, as a context manager.
 
     Raises:
         ValueError: Their number is out of range.
     """
-    return open_pool(running.engine, running.workers, timeout=running.timeout)
+    workers = running.workers
+    if workers is None and running.engine == "local":
+        workers = planned_workers(*requests)
+    return open_pool(running.engine, workers, timeout=running.timeout)
+
+
+def make_split(
+    category: str, options: DataOptions, out: Path, running: Running | None = None
+) -> Made:
+    """Make OUT/CATEGORY/SPLIT, or finish one that was begun: `scapo-data generate`.
+
+    Raises:
+        ValueError: An option is out of range, the category is unknown, or has no such objects.
+        RenderError: The backend does not work here.
+        GenerateError: See `generate`.
+    """
+    if options.source != "procedural":  # workers elsewhere stand in another folder
+        options = replace(options, source=str(Path(options.source).absolute()))
+    request, assets = make_request(category, options)
+    found = versions(request.settings.backend)
+    return generate(request, assets, out / category / options.split, found, running)
 
 
 def generate(
@@ -96,7 +119,7 @@ def generate(
         folder: Of the split.
         versions: Of what makes the pixels, for the manifest.
         running: How.
-        pool: Of `open_workers(running)`, to use the same workers for several splits; it stays open.
+        pool: Of `open_workers`, to use the same workers for several splits; it stays open.
 
     Raises:
         GenerateError: The folder holds something else, is in use or cannot be written; no object
@@ -112,7 +135,7 @@ def generate(
     }
     with (
         Ledger(folder, identity, versions) as ledger,
-        open_workers(running) if pool is None else nullcontext(pool) as workers,
+        open_workers(running, request) if pool is None else nullcontext(pool) as workers,
     ):
         finished = ledger.finished()
         complete = _complete(ledger, finished)
@@ -121,7 +144,7 @@ def generate(
                 write_card(folder)
             return complete
         entries, refused = ledger.entries(assets) or _describe(
-            workers, assets, request.instances, running
+            workers, assets, request.instances, (running, ledger.refused())
         )
         if not entries:
             why = "; ".join(refused.values())
@@ -146,7 +169,9 @@ def _complete(ledger: Ledger, finished: Mapping[str, ShardDone]) -> Made | None:
         return None
     if any(shard.file not in finished for shard in manifest.shards):
         return None
-    return Made(folder=ledger.folder, manifest=manifest, kept=len(finished))
+    return Made(
+        folder=ledger.folder, manifest=manifest, failed=manifest.left_out, kept=len(finished)
+    )
 
 
 def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Running) -> Made:
@@ -175,24 +200,29 @@ def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Ru
     made = _render(ledger, pool, [job for job in jobs if job.plan.file not in kept], running)
     shards = [{**kept, **made}[job.plan.file] for job in jobs]
     failed = {name: why for shard in shards for name, why in shard.failed.items()}
-    manifest = _manifest(ledger, options, request, used, shards, len(work.refused))
+    manifest = replace(
+        _manifest(ledger, options, request, used, shards, len(work.refused)),
+        left_out={**work.refused, **failed},
+    )
     ledger.finish(manifest, [shard.file for shard in shards if not shard.count])
     write_card(ledger.folder)
-    return Made(
-        folder=ledger.folder,
-        manifest=manifest,
-        failed={**work.refused, **failed},
-        kept=len(kept),
-    )
+    return Made(folder=ledger.folder, manifest=manifest, failed=manifest.left_out, kept=len(kept))
 
 
 def _describe(
-    pool: AbstractPool[Any, Any], assets: Sequence[Asset], wanted: int, running: Running
+    pool: AbstractPool[Any, Any],
+    assets: Sequence[Asset],
+    wanted: int,
+    how: tuple[Running, Mapping[str, str]],
 ) -> tuple[tuple[Entry, ...], dict[str, str]]:
-    """Read objects until there are enough; those that cannot be read come with the reason."""
+    """Read objects until there are enough; those that cannot be read come with the reason.
+
+    Those that an earlier run refused stay refused: others have taken their place.
+    """
+    running, before = how
     found: dict[str, Entry] = {}
-    refused: dict[str, str] = {}
-    waiting = list(assets)
+    refused: dict[str, str] = dict(before)
+    waiting = [asset for asset in assets if asset.name not in refused]
     running.progress("objects", 0, wanted)
     while waiting and len(found) < wanted:
         batch, waiting = waiting[: wanted - len(found)], waiting[wanted - len(found) :]

@@ -12,12 +12,16 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from scapo.store import canonical_json, sha256_file, write_bytes
+from scapo.store.json_records import StoreError, from_json, read_json
 from scapo.store.manifest import Instance, Manifest, ManifestError, read_manifest
+from scapo.store.regular import read_regular
+from scapo.text import one_line
 from sim_assets.generation.assets import Asset
 from sim_assets.generation.plan import Entry
 from sim_assets.generation.shard import ShardDone, read_done
@@ -31,6 +35,25 @@ PLAN_FORMAT = "scapo-plan/1"
 
 class GenerateError(RuntimeError):
     """A split cannot be made: `where: what was expected, what was found`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Planned:
+    """An object as first read."""
+
+    instance: Instance
+    geometry: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Plan:
+    """All of `.plan.json`."""
+
+    format: str
+    identity: dict[str, Any]
+    versions: dict[str, str]
+    entries: tuple[_Planned, ...]
+    refused: dict[str, str]
 
 
 class Ledger:
@@ -50,7 +73,7 @@ class Ledger:
         self.identity = json.loads(canonical_json(identity))
         self.versions = dict(versions)
         self.manifest: Manifest | None = None
-        self.plan: dict[str, Any] | None = None
+        self.plan: _Plan | None = None
         self._lock = -1
 
     def __enter__(self) -> Ledger:
@@ -93,15 +116,24 @@ class Ledger:
         if self.plan is None:
             return None
         by_name = {asset.name: asset for asset in assets}
+        for row in self.plan.entries:
+            if row.instance.id not in by_name:
+                raise GenerateError(
+                    f"{self.folder}: expected the objects it was begun with, found no "
+                    f"{one_line(row.instance.id, 200)!r}; delete the folder to make it anew"
+                )
         entries = tuple(
-            Entry(
-                asset=by_name[row["instance"]["id"]],
-                instance=Instance(**_tuples(row["instance"])),
-                geometry=row["geometry"],
-            )
-            for row in self.plan["entries"]
+            Entry(asset=by_name[row.instance.id], instance=row.instance, geometry=row.geometry)
+            for row in self.plan.entries
         )
-        return entries, self.plan["refused"]
+        return entries, self.plan.refused
+
+    def refused(self) -> dict[str, str]:
+        """Objects that an earlier run refused, with the reason, beside its finished manifest."""
+        if self.manifest is None:
+            return {}
+        shown = {record.id for record in self.manifest.instances}
+        return {n: why for n, why in self.manifest.left_out.items() if n not in shown}
 
     def begin(self, entries: Sequence[Entry], refused: Mapping[str, str]) -> None:
         """Record the objects before the first shard is made.
@@ -110,31 +142,32 @@ class Ledger:
             GenerateError: A finished data set is there, made from other objects.
         """
         if self.manifest is not None:
-            before = {(record.id, record.sha256) for record in self.manifest.instances}
-            if not before <= {(entry.instance.id, entry.instance.sha256) for entry in entries}:
+            before = [(record.id, record.sha256) for record in self.manifest.instances]
+            there = [(entry.instance.id, entry.instance.sha256) for entry in entries]
+            if there[: len(before)] != before:
                 raise GenerateError(
                     f"{self.folder}: expected the objects of its manifest, found others; choose "
                     "another folder or delete this one"
                 )
-        rows = [{"instance": asdict(e.instance), "geometry": e.geometry} for e in entries]
-        plan = {
-            "format": PLAN_FORMAT,
-            "identity": self.identity,
-            "versions": self.versions,
-            "entries": rows,
-            "refused": dict(refused),
-        }
-        write_bytes(self.folder / PLAN, canonical_json(plan).encode())
+        plan = _Plan(
+            format=PLAN_FORMAT,
+            identity=self.identity,
+            versions=self.versions,
+            entries=tuple(_Planned(instance=e.instance, geometry=e.geometry) for e in entries),
+            refused=dict(refused),
+        )
+        write_bytes(self.folder / PLAN, canonical_json(asdict(plan)).encode())
 
     def finished(self) -> dict[str, ShardDone]:
         """Shards that are there whole, by file name: none with an object that failed."""
         done = {}
         for file, sha256 in self._recorded().items():
             path = self.folder / file
-            if path.is_file() and sha256_file(path) == sha256:
-                shard = read_done(path, sha256)
-                if not shard.failed:
-                    done[file] = shard
+            with suppress(StoreError):  # of another program: made anew
+                if path.is_file() and sha256_file(path) == sha256:
+                    shard = read_done(path, sha256)
+                    if not shard.failed:
+                        done[file] = shard
         return done
 
     def record(self, shard: ShardDone) -> None:
@@ -165,6 +198,7 @@ class Ledger:
     def _look(self) -> None:
         for path in self.folder.glob(".*.tmp"):  # of a run that was killed while writing
             path.unlink(missing_ok=True)
+        self._refuse_odd()
         if (self.folder / "manifest.json").exists():
             try:
                 self.manifest = read_manifest(self.folder / "manifest.json")
@@ -173,11 +207,11 @@ class Ledger:
             self._compare(self._identity_of(self.manifest))
         if (self.folder / PLAN).exists():
             self.plan = self._read_plan()
-            self._compare(self.plan["identity"])
-            if self.plan["versions"] != self.versions:
+            self._compare(self.plan.identity)
+            if self.plan.versions != self.versions:
                 raise GenerateError(
                     f"{self.folder}: expected the versions it was begun with, "
-                    f"{_difference(self.plan['versions'], self.versions)}; delete the folder to "
+                    f"{_difference(self.plan.versions, self.versions)}; delete the folder to "
                     "make it anew"
                 )
         if self.manifest is None and self.plan is None:
@@ -187,21 +221,30 @@ class Ledger:
                     f"{self.folder}: expected an empty folder, found {found[0]} without a manifest"
                 )
 
-    def _read_plan(self) -> dict[str, Any]:
+    def _refuse_odd(self) -> None:
+        """Records that are links lead to other people's files, pipes and devices nowhere."""
+        for path in (self.folder / name for name in ("manifest.json", PLAN, FINISHED)):
+            if path.is_symlink() or (path.exists() and not path.is_file()):
+                raise GenerateError(
+                    f"{path}: expected a file of its own, found a link, a folder or a device"
+                )
+
+    def _read_plan(self) -> _Plan:
+        path = self.folder / PLAN
         try:
-            plan = json.loads((self.folder / PLAN).read_text())
-        except (OSError, ValueError) as error:
-            raise GenerateError(f"{self.folder / PLAN}: expected JSON, found {error}") from error
-        if not isinstance(plan, dict) or plan.get("format") != PLAN_FORMAT:
-            raise GenerateError(f"{self.folder / PLAN}: expected format {PLAN_FORMAT!r}")
-        return plan
+            plan = read_json(path)
+            if not isinstance(plan, dict) or plan.get("format") != PLAN_FORMAT:
+                raise GenerateError(f"{path}: expected format {PLAN_FORMAT!r}")
+            return from_json(_Plan, plan, str(path))
+        except StoreError as error:
+            raise GenerateError(f"{error}; delete the folder to make it anew") from error
 
     def _recorded(self) -> dict[str, str]:
         recorded = {}
         if self.manifest is not None:
             recorded = {shard.file: shard.sha256 for shard in self.manifest.shards}
         try:
-            lines = (self.folder / FINISHED).read_text().splitlines()
+            lines = read_regular(self.folder / FINISHED).decode(errors="replace").splitlines()
         except FileNotFoundError:
             lines = []
         for line in lines:
@@ -239,14 +282,5 @@ def _difference(there: Mapping[str, Any], asked: Mapping[str, Any]) -> str:
             continue
         if isinstance(a, dict) and isinstance(b, dict):
             return _difference(a, b)
-        return f"{name} {a}, found {name} {b}"
+        return f"{name} {one_line(a, 200)}, found {name} {one_line(b, 200)}"
     return "the same"
-
-
-def _tuples(row: dict[str, Any]) -> dict[str, Any]:
-    """Lists of a JSON object as tuples."""
-
-    def frozen(value: Any) -> Any:  # noqa: ANN401
-        return tuple(frozen(item) for item in value) if isinstance(value, list) else value
-
-    return {name: frozen(value) for name, value in row.items()}

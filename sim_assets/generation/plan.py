@@ -16,7 +16,9 @@ from typing import Any
 from scapo.store import canonical_json
 from scapo.store.manifest import Instance
 from sim_assets.generation.assets import Asset
+from sim_assets.models.account import sentences
 from sim_assets.objects import ArticulatedObject
+from sim_assets.sampling.ambiguity import CHOSEN as TOLERANCE
 from sim_assets.sampling.samples import Settings
 
 SHARD_SAMPLES = 64
@@ -45,9 +47,11 @@ class Request:
         settings = asdict(self.settings)
         camera = settings.pop("camera")
         settings.pop("held_out")  # said by the split
-        for name, usual in (("preset", "sim-art"), ("mask", "exact")):
+        for name, usual in (("preset", "sim-art"), ("mask", "exact"), ("ambiguity", False)):
             if settings[name] == usual:
                 settings.pop(name)
+        if self.settings.ambiguity:
+            settings["ambiguity"] = asdict(TOLERANCE)
         return {
             **settings,
             "camera": camera,
@@ -154,6 +158,8 @@ def instance_record(thing: ArticulatedObject) -> Instance:
         rest=dict(origin.rest),
         joint_names=origin.joint_names,
         sign=origin.sign,
+        trait=thing.trait,
+        account=sentences(thing),
     )
 
 

@@ -6,24 +6,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from importlib import metadata
 from math import ceil
-from pathlib import Path
 
 from scapo.categories import category as find_category
 from sim_assets.generation.assets import Asset, folder_assets, procedural_assets
 from sim_assets.generation.plan import Request
-from sim_assets.options import DataOptions, Protocol
+from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import resolve_backend
 from sim_assets.rendering.base import Backend
-from sim_assets.sampling.presets import camera, rules
+from sim_assets.sampling.presets import camera, find_preset
 from sim_assets.sampling.samples import Settings
 
 SAMPLES_PER_INSTANCE = 50
-"""By default, as the benchmark's training split (CONTRACT 4)."""
+"""By default, as the benchmark's training split (docs/benchmark.md)."""
 MIN_IMAGE, MAX_IMAGE = 32, 4096
 
 
-def make_request(category: str, options: DataOptions) -> tuple[Request, list[Asset]]:
+def make_request(
+    category: str, options: DataOptions, models: Sequence[Asset] | None = None
+) -> tuple[Request, list[Asset]]:
     """The request and the objects to choose from.
+
+    Args:
+        category: Of the objects.
+        options: What data to make.
+        models: Of the folder `options.source`, chosen by the caller; by default those of its split.
 
     Raises:
         ValueError: An option is out of range, the category is unknown, or has no such objects.
@@ -36,9 +42,10 @@ def make_request(category: str, options: DataOptions) -> tuple[Request, list[Ass
         instances = options.instances or ceil(options.count / SAMPLES_PER_INSTANCE)
         assets = procedural_assets(category, options.split, options.seed, instances)
     else:
-        assets = _models(category, options)
+        assets = _models(category, options) if models is None else list(models)
         instances = options.instances or min(len(assets), options.count)
     given = {name: getattr(options, name) for name in ("up", "front", "scale")}
+    given["any_model"] = options.any_model or None
     request = Request(
         category=category,
         split=options.split,
@@ -52,17 +59,17 @@ def make_request(category: str, options: DataOptions) -> tuple[Request, list[Ass
     return request, assets
 
 
-def versions(backend: Backend | None, protocol: Protocol) -> dict[str, str]:
-    """Versions of what makes the pixels here."""
+def versions(backend: Backend | None) -> dict[str, str]:
+    """Versions of what makes the pixels here; of no renderer where the backend is None."""
     names = ["scapo", "numpy", "trimesh"]
     drawn: dict[str, str] = {}
-    if protocol != "full" and backend == "raycast":
+    if backend == "raycast":
         names.append("embreex")
-    elif protocol != "full" and backend == "sapien":
+    elif backend == "sapien":
         from sim_assets.rendering import sapien as scene
 
         drawn = scene.versions()
-    elif protocol != "full" and backend == "maniskill":
+    elif backend == "maniskill":
         from sim_assets.rendering import maniskill as parallel_scene
 
         drawn = parallel_scene.versions()
@@ -70,14 +77,21 @@ def versions(backend: Backend | None, protocol: Protocol) -> dict[str, str]:
 
 
 def _settings(options: DataOptions) -> Settings:
-    preset = rules(options.preset)
+    preset = find_preset(options.preset)
     protocol = options.protocol or preset.protocol
-    needed = protocol != "full"
-    if not needed and (options.noise, options.mask) != ("none", "exact"):
+    if preset.paired and protocol != "full":
+        raise ValueError(f"protocol: expected full with preset {options.preset}, found {protocol}")
+    needed = protocol != "full" or preset.paired
+    if protocol == "full" and (options.noise, options.mask) != ("none", "exact"):
         raise ValueError(
             f"noise and mask: expected none and exact with protocol full, which has no picture, "
             f"found {options.noise} and {options.mask}"
         )
+    if options.ambiguity:
+        if protocol == "isolated":
+            raise ValueError("ambiguity: expected protocol joint or full, found isolated")
+        if needed:
+            resolve_backend("raycast")  # turned objects are rendered by it, whatever the backend
     return Settings(
         protocol=protocol,
         backend=resolve_backend(options.backend) if needed else None,
@@ -90,20 +104,14 @@ def _settings(options: DataOptions) -> Settings:
         held_out=options.split in ("test", "test-ood"),
         noise=options.noise,
         mask=options.mask,
+        ambiguity=options.ambiguity,
     )
 
 
 def _models(category: str, options: DataOptions) -> list[Asset]:
     if options.split == "test-ood":
         raise ValueError("split test-ood: expected procedural objects, found --source with a path")
-    found = folder_assets(
-        Path(options.source),
-        category,
-        options.split,
-        up=options.up,
-        front=options.front,
-        scale=options.scale,
-    )
+    found = folder_assets(category, options)
     if options.instances is not None and options.instances > len(found):
         raise ValueError(
             f"instances: expected at most {len(found)}, the models of split {options.split!r} in "
@@ -140,5 +148,7 @@ def _check(options: DataOptions) -> None:
             f"count: expected a multiple of states_per_view, {options.states_per_view}, found "
             f"{options.count}"
         )
-    if options.source == "procedural" and (options.up or options.front or options.scale):
-        raise ValueError("up, front, scale: expected only with a --source folder of models")
+    asked = options.up or options.front or options.scale or options.any_model
+    if options.source == "procedural" and asked:
+        names = "up, front, scale, any_model"
+        raise ValueError(f"{names}: expected only with a --source folder of models")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The jobs that workers do: describe an object, and render a shard to its file.
 
-The views of the objects of a shard: one object after the other, or several at once.
+A shard's objects are shown one after the other, or several at once where the renderer can.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from scapo.parallel.pool import Report, describe_error
 from scapo.store import SAMPLES, read_header, write
+from scapo.store.json_records import from_json
 from sim_assets.generation.assets import Asset
 from sim_assets.generation.plan import Entry, Piece, Request, ShardPlan, instance_record
 from sim_assets.generation.request import versions
@@ -25,24 +26,24 @@ from sim_assets.objects import ArticulatedObject
 from sim_assets.rendering.backends import make_renderer
 from sim_assets.rendering.base import AbstractParallelRenderer, AbstractRenderer, Backend
 from sim_assets.sampling.samples import (
+    RenderedView,
     Row,
-    Shooter,
-    Shot,
-    Take,
-    divide,
+    SampleMaker,
+    ViewBatch,
     geometry_digest,
-    shoot_together,
+    render_together,
+    split_batches,
 )
 
 REPORT_EVERY = 8
-"""Shots between two signs of life: each crosses to the parent process."""
+"""Views between two signs of life: each crosses to the parent process."""
 TOGETHER = "several objects at once"
 """What a worker reports that shows them."""
 
 
-def shoot_piece(
+def render_piece(
     request: Request, piece: Piece, renderer: AbstractRenderer | None, report: Report
-) -> list[Shot]:
+) -> list[RenderedView]:
     """Views of one object.
 
     Raises:
@@ -52,55 +53,57 @@ def shoot_piece(
     """
     settings = request.settings
     name = piece.entry.instance.id
-    shooter = Shooter(renderer, load(piece, report), settings)
-    shots, told = [], 0
-    for shot in shooter.shots(_keys(request, piece)):
-        shots.append(shot)
-        if len(shots) - told >= REPORT_EVERY or len(shots) == piece.views:
-            report(name, (len(shots) - told) * settings.states_per_view)
-            told = len(shots)
-    return shots
+    maker = SampleMaker(renderer, load(piece, report), settings)
+    rendered, reported = [], 0
+    for view in maker.render_views(_keys(request, piece)):
+        rendered.append(view)
+        if len(rendered) - reported >= REPORT_EVERY or len(rendered) == piece.views:
+            report(name, (len(rendered) - reported) * settings.states_per_view)
+            reported = len(rendered)
+    return rendered
 
 
-def shoot_pieces(
+def render_pieces(
     request: Request, pieces: Sequence[Piece], renderer: AbstractParallelRenderer, report: Report
-) -> dict[int, list[Shot] | Exception]:
+) -> dict[int, list[RenderedView] | Exception]:
     """Views of several objects at once, by the piece's index.
 
     Those that are not in the answer were not shown because the renderer failed: they may be tried
     one by one.
     """
-    made: dict[int, list[Shot] | Exception] = {}
-    shown: list[tuple[Piece, Shooter]] = []
+    made: dict[int, list[RenderedView] | Exception] = {}
+    shown: list[tuple[Piece, SampleMaker]] = []
     for piece in pieces:
         thing = _try_load(piece, report)
         if isinstance(thing, Exception):
             made[piece.index] = thing
         else:
-            shown.append((piece, Shooter(None, thing, request.settings)))
+            shown.append((piece, SampleMaker(None, thing, request.settings)))
     if not shown:
         return made
     label = TOGETHER if len(shown) > 1 else shown[0][0].entry.instance.id
-    told = 0
+    reported = 0
 
-    def heard(take: Take) -> None:
-        nonlocal told
-        amount = len(take.shots) * request.settings.states_per_view
-        told += amount
+    def on_progress(batch: ViewBatch) -> None:
+        nonlocal reported
+        amount = len(batch.rendered) * request.settings.states_per_view
+        reported += amount
         report(label, amount)
 
     report(label, 0)
-    groups = divide([(shooter, _keys(request, p)) for p, shooter in shown], renderer.places)
+    groups = split_batches([(maker, _keys(request, p)) for p, maker in shown], renderer.capacity)
     try:
-        shoot_together(renderer, [take for group in groups for take in group], heard)
+        render_together(renderer, [batch for group in groups for batch in group], on_progress)
     except Exception:
         if len(shown) == 1:
             raise
-        report(label, -told)
+        report(label, -reported)
         return made
     for (piece, _), group in zip(shown, groups, strict=True):
-        errors = [take.error for take in group if take.error is not None]
-        made[piece.index] = errors[0] if errors else [shot for take in group for shot in take.shots]
+        errors = [batch.error for batch in group if batch.error is not None]
+        made[piece.index] = (
+            errors[0] if errors else [view for batch in group for view in batch.rendered]
+        )
     return made
 
 
@@ -177,7 +180,7 @@ def render_shard(job: ShardJob, report: Report) -> ShardDone:
     An object that fails is left out with its reason, unless `strict`.
     """
     rows: list[Row] = []
-    shots: list[Shot] = []
+    rendered: list[RenderedView] = []
     failed: dict[str, str] = {}
     for piece, result in _results(job, report):
         if isinstance(result, Exception):
@@ -187,10 +190,10 @@ def render_shard(job: ShardJob, report: Report) -> ShardDone:
             failed[name] = describe_error(result)
             report(name, piece.views * job.request.settings.states_per_view)
             continue
-        shots += result
+        rendered += result
         index = np.array(piece.index, np.int32)
-        rows += [{**row, "instance": index} for shot in result for row in shot.rows]
-    return _write(job, rows, shots, failed)
+        rows += [{**row, "instance": index} for view in result for row in view.rows]
+    return _write(job, rows, rendered, failed)
 
 
 def render_shard_alike(job: ShardJob, report: Report) -> ShardDone:
@@ -200,7 +203,7 @@ def render_shard_alike(job: ShardJob, report: Report) -> ShardDone:
         ValueError: What makes the pixels here has other versions than where the data set was begun.
     """
     settings = job.request.settings
-    found = _versions(settings.backend, settings.protocol)
+    found = _versions(settings.backend)
     if found != job.versions:
         names = sorted(n for n in {*found, *job.versions} if found.get(n) != job.versions.get(n))
         expected, there = (
@@ -214,14 +217,16 @@ def render_shard_alike(job: ShardJob, report: Report) -> ShardDone:
 _versions = lru_cache(maxsize=4)(versions)
 
 
-def _results(job: ShardJob, report: Report) -> Iterator[tuple[Piece, list[Shot] | Exception]]:
+def _results(
+    job: ShardJob, report: Report
+) -> Iterator[tuple[Piece, list[RenderedView] | Exception]]:
     """What became of each object of the shard, in order."""
     settings = job.request.settings
     renderer = _renderer(settings.backend, settings.color)
-    made: Mapping[int, list[Shot] | Exception] = {}
+    made: Mapping[int, list[RenderedView] | Exception] = {}
     if isinstance(renderer, AbstractParallelRenderer) and not job.apart:
         wanted = [p for p in job.plan.pieces if p.entry.instance.id not in job.skip]
-        made = shoot_pieces(job.request, wanted, renderer, report)
+        made = render_pieces(job.request, wanted, renderer, report)
     for piece in job.plan.pieces:
         if piece.entry.instance.id in job.skip:
             yield piece, RuntimeError(job.skip[piece.entry.instance.id])
@@ -233,11 +238,11 @@ def _results(job: ShardJob, report: Report) -> Iterator[tuple[Piece, list[Shot] 
 
 def _try_piece(
     request: Request, piece: Piece, renderer: AbstractRenderer | None, report: Report
-) -> list[Shot] | Exception:
+) -> list[RenderedView] | Exception:
     try:
         if isinstance(renderer, AbstractParallelRenderer):
-            return shoot_pieces(request, [piece], renderer, report)[piece.index]
-        return shoot_piece(request, piece, renderer, report)
+            return render_pieces(request, [piece], renderer, report)[piece.index]
+        return render_piece(request, piece, renderer, report)
     except Exception as error:  # noqa: BLE001 - whatever it is, it costs this object only
         return error
 
@@ -247,13 +252,15 @@ def _renderer(backend: Backend | None, color: bool) -> AbstractRenderer | None:
     return None if backend is None else make_renderer(backend, color=color)
 
 
-def _write(job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, str]) -> ShardDone:
-    digest = hashlib.sha256(b"".join(shot.plan for shot in shots)).hexdigest()
+def _write(
+    job: ShardJob, rows: list[Row], rendered: list[RenderedView], failed: dict[str, str]
+) -> ShardDone:
+    digest = hashlib.sha256(b"".join(view.plan for view in rendered)).hexdigest()
     done = {
         "count": len(rows),
         "plan": digest,
-        "views": len(shots),
-        "draws": sum(shot.draws for shot in shots),
+        "views": len(rendered),
+        "draws": sum(view.draws for view in rendered),
         "failed": failed,
     }
     header = {
@@ -276,7 +283,10 @@ def _write(job: ShardJob, rows: list[Row], shots: list[Shot], failed: dict[str, 
 
 
 def read_done(path: Path, sha256: str) -> ShardDone:
-    """What a finished shard says of itself; `sha256` is that of its bytes."""
-    header = read_header(path, SAMPLES)
-    names = ("count", "plan", "views", "draws", "failed")
-    return ShardDone(file=path.name, sha256=sha256, **{name: header[name] for name in names})
+    """What a finished shard says of itself; `sha256` is that of its bytes.
+
+    Raises:
+        StoreError: It is none of ours.
+    """
+    known = {"file": path.name, "sha256": sha256}
+    return from_json(ShardDone, {**read_header(path, SAMPLES), **known}, str(path))

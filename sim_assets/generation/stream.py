@@ -17,7 +17,7 @@ from sim_assets.generation.plan import Request, samples_per_instance
 from sim_assets.generation.request import make_request
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import make_renderer
-from sim_assets.sampling.samples import Row, Shooter
+from sim_assets.sampling.samples import Row, SampleMaker
 
 
 def stream(category: str, **options: Any) -> Iterator[Sample]:  # noqa: ANN401
@@ -37,11 +37,11 @@ def _samples(request: Request, assets: Sequence[Asset]) -> Iterator[Sample]:
             if first >= last:
                 return
             states = settings.states_per_view
-            shooter = Shooter(renderer, asset.load(), settings)
+            maker = SampleMaker(renderer, asset.load(), settings)
             keys = [request.key(view) for view in range(first // states, last // states)]
-            rows = (row for shot in shooter.shots(keys) for row in shot.rows)
+            rows = (row for view in maker.render_views(keys) for row in view.rows)
             for index, row in enumerate(rows, first):
-                yield _sample(request, row, index, shooter.thing.instance)
+                yield _sample(request, row, index, maker.thing.instance)
 
 
 def _sample(request: Request, row: Row, index: int, instance: str) -> Sample:

@@ -3,7 +3,7 @@
 
 Their camera looks along -z with y up (OpenGL); ours along z with y down. Their part frames differ
 from ours by a constant turn, chosen so that the swap symmetry that is published for their frames is
-that of CONTRACT 1 in ours: `turned` applies it.
+that of our object frame: `turned` applies it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from scapo.types import Category
+from scapo.categories import Category
+from scapo.geometry.matrices import rotation_error
 from sim_assets.models.validate import AssetError, refuse
 
 OPENCV_T_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -111,8 +112,7 @@ def rigid(
     Raises:
         AssetError: A matrix is no rotation.
     """
-    gap = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max((1, 2))
-    wrong = (gap > SKEW) | (np.linalg.det(rotation) < 0)
+    wrong = rotation_error(rotation) > SKEW
     if wrong.any():
         part = int(np.argmax(wrong))
         raise refuse(path, f"a rotation of part {part} in {key!r}", f"{rotation[part].tolist()}")
@@ -172,7 +172,7 @@ def find_files(path: Path, ending: str) -> list[Path]:
     found = [
         file
         for file in path.rglob(f"*{ending}")
-        if file.is_file() and not any(p.startswith(".") for p in file.relative_to(path).parts)
+        if not file.is_dir() and not any(p.startswith(".") for p in file.relative_to(path).parts)
     ]
     if not found:
         raise refuse(path, f"{ending} files in the folder", "none")

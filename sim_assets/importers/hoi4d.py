@@ -20,7 +20,7 @@ from typing import Any
 
 from sim_assets.importers.models import Body, Folder, Hinge, Model, find_folders, joined, safe_word
 from sim_assets.importers.records import Mesh, direction, member, read_json, read_obj, vector
-from sim_assets.models.validate import refuse
+from sim_assets.models.validate import read_number, refuse
 
 SET = "hoi4d"
 TREE = "result.json"
@@ -115,9 +115,12 @@ def _integer(path: Path, record: object, key: str) -> int:
     """An integer, which may be written as text."""
     value = member(path, record, key, (int, str))
     try:
-        return int(value)
-    except ValueError as error:
-        raise refuse(path, f"{key!r} as an integer", repr(value)) from error
+        found = read_number(value)
+    except ValueError:
+        found = math.nan
+    if not found.is_integer():
+        raise refuse(path, f"{key!r} as an integer", repr(value))
+    return int(found)
 
 
 def _turning(path: Path, leaves: dict[int, Any]) -> list[tuple[list[int], object]]:
@@ -163,8 +166,8 @@ def _limits(path: Path, limit: object) -> tuple[float, float] | None:
     if not isinstance(limit, dict) or limit.get("noLimit") is True:
         return None
     try:
-        ends = sorted(float(limit[key]) for key in ("a", "b"))
-    except (KeyError, TypeError, ValueError) as error:
+        ends = sorted(read_number(limit[key]) for key in ("a", "b"))
+    except (KeyError, ValueError) as error:
         raise refuse(path, "'limit' with numbers a and b", f"{limit!r:.80}") from error
     if not all(math.isfinite(end) for end in ends):
         raise refuse(path, "finite limits", f"{limit!r:.80}")

@@ -7,6 +7,7 @@ and units of its files; `sets` writes them.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import re
@@ -17,15 +18,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, Category
 from scapo.export.urdf import Joint, Link, Surface
-from scapo.types import Category
 from sim_assets.importers.records import Mesh, Vector
 from sim_assets.models.joints import hull_area, hull_points, moved
 from sim_assets.models.validate import refuse
 from sim_assets.objects import joint_motion
 
 STEPS = 91
+MAX_WORD = 200
+"""Characters of the name of a file or link."""
 CLOSED = 0.35
 """Of the hull's range over a turn, above its smallest: a thick door or lid that is pushed into its
 body makes the hull smaller still, while a laptop that stands open by 30 degrees comes to more."""
@@ -98,8 +100,11 @@ def our_category(name: str) -> str:
 
 
 def safe_word(text: str) -> str:
-    """Letters, digits, `_`, `.` and `-` of ASCII, as file and link names need them."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._") or "x"
+    """Letters, digits, `_`, `.` and `-` of ASCII, as names of files and links; not too many."""
+    word = re.sub(r"[^A-Za-z0-9_.-]+", "_", text).strip("._") or "x"
+    if len(word) <= MAX_WORD:
+        return word
+    return f"{word[:80]}-{hashlib.sha256(os.fsencode(text)).hexdigest()[:8]}"
 
 
 def find_folders(path: Path, marks: Collection[str]) -> list[Folder]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """OP-Align's "Light" clouds: `pc/{full|partial}/<category>/{train|test}/<index>.pt`.
 
-One file is a torch dict (PROTOCOL 2.6): `pc` (N,3), `label` (N) 0..P-1, `part_pv_point` and
+One file is a torch dict (docs/protocol.md): `pc` (N,3), `label` (N) 0..P-1, `part_pv_point` and
 `part_axis` (J,3), `pose_segs` (P,4,4), `idx`; index = instance number x 100 + state number. The
 diagonal of the box at rest is 1, the origin is the mean of the object's points: the camera of the
 partial clouds stood at an unknown place along +z, and full clouds have none.
@@ -70,7 +70,7 @@ def _index(path: Path) -> int | None:
 
 def _file(path: Path) -> CloudFile:
     """Category, split and instance from the folders; a misplaced file has no category."""
-    parts = path.resolve().parts
+    parts = (*path.parent.resolve().parts, path.name)  # be the file itself a link to anywhere
     index = _index(path)
     nowhere = CloudFile(path=path, name=path.name, category="", split="", instance="")
     if len(parts) < 4 or index is None:

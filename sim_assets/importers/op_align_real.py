@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """OP-Align's real set: `<category>_output/{train|test}/<instance>/<state>/input_2/<time>.npz`.
 
-One file is one RGB-D view, a pickled dict under `arr_0` (PROTOCOL 2.7): `pc` (480 x 640 points in
+One file is one RGB-D view, a pickled dict under `arr_0`: `pc` (480 x 640 points in
 decimetres, camera looking along -z, zeros where invalid), `color` in [0, 1], `detection` (an
 object mask of a detector), `segmentation` (0 background, 1..P parts), `part` (P rows of rotation 9,
 translation 3, size 3), `joint` (J rows of pivot 3, then direction 3: the set's README states the
@@ -12,7 +12,7 @@ those labelled 0 as background. The part frames are the set's own rest frames, t
 per category so that the swap symmetry is ours; they are not our object frame, whose offset from
 them nobody knows. Joint states and visible shares are unknown: NaN. The direction of a joint need
 not be the one that opens. The camera row is fitted to the points' places in the image, which a
-pinhole fixes; where the fit is poor it is the nominal one of CONTRACT 4's sensor.
+pinhole fixes; where the fit is poor it is the nominal one of the benchmark's sensor.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def find(path: Path) -> list[CloudFile]:
 
 def _file(path: Path) -> CloudFile:
     """Category, split and instance from the folders; a misplaced file has no category."""
-    parts = path.resolve().parts
+    parts = (*path.parent.resolve().parts, path.name)  # be the file itself a link to anywhere
     for k in range(len(parts) - 3, -1, -1):
         if parts[k] in CATEGORIES and parts[k + 1] in ("train", "test"):
             return CloudFile(

@@ -11,9 +11,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim_assets.models.validate import MAX_COORDINATE, MAX_FACES, MAX_MESH_BYTES, AssetError, refuse
+from sim_assets.models.validate import (
+    MAX_COORDINATE,
+    MAX_FACES,
+    MAX_MESH_BYTES,
+    read_file,
+    read_number,
+    refuse,
+)
 
 MAX_JSON_BYTES = 16 << 20
+MAX_DIGITS = 18
+"""Of an integer."""
 
 Vector = Float[np.ndarray, " 3"]
 
@@ -32,16 +41,20 @@ def read_json(path: Path) -> Any:  # noqa: ANN401
     Raises:
         AssetError: Missing, too large, not JSON.
     """
+    data = read_file(path, MAX_JSON_BYTES)
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise refuse(path, f"at most {MAX_JSON_BYTES >> 20} MiB", "more")
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except AssetError:
-        raise
-    except OSError as error:
-        raise refuse(path, "a readable file", str(error.strerror)) from error
-    except (ValueError, RecursionError) as error:
-        raise refuse(path, "JSON", " ".join(str(error).split())) from error
+        return json.loads(data.decode("utf-8-sig"), parse_int=_integer)
+    except RecursionError as error:
+        raise refuse(path, "JSON", "values nested too deeply") from error
+    except ValueError as error:
+        raise refuse(path, "JSON", str(error)) from error
+
+
+def _integer(digits: str) -> int:
+    """An integer of JSON that arrays can hold."""
+    if len(digits) > MAX_DIGITS:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
 
 
 def member(path: Path, record: object, key: str, kind: type | tuple[type, ...]) -> Any:  # noqa: ANN401
@@ -69,8 +82,8 @@ def vector(path: Path, record: object, key: str) -> Vector:
     """
     value = member(path, record, key, list)
     try:
-        numbers = np.array([float(number) for number in value])
-    except (TypeError, ValueError) as error:
+        numbers = np.array([read_number(item) for item in value])
+    except ValueError as error:
         raise refuse(path, f"{key!r} as three numbers", f"{value!r:.80}") from error
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
         raise refuse(path, f"{key!r} as three finite numbers", f"{value!r:.80}")
@@ -96,16 +109,13 @@ def read_obj(path: Path) -> Mesh:
     Raises:
         AssetError: Unreadable, other numbers than three a line, indices out of range, no triangle.
     """
-    try:
-        if path.stat().st_size > MAX_MESH_BYTES:
-            raise refuse(path, f"at most {MAX_MESH_BYTES >> 20} MiB", "more")
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise refuse(path, "a readable file", str(error.strerror)) from error
+    text = read_file(path, MAX_MESH_BYTES).decode("utf-8", errors="replace")
+    if text.count("\nf ") > MAX_FACES:
+        raise refuse(path, f"at most {MAX_FACES} triangles", "more")
     lines = [line.split() for line in text.splitlines()]
     try:
-        rows = [[float(word) for word in line[1:4]] for line in lines if line[:1] == ["v"]]
-        corners = [[int(w.split("/")[0]) for w in line[1:]] for line in lines if line[:1] == ["f"]]
+        rows = [[read_number(word) for word in line[1:4]] for line in lines if line[:1] == ["v"]]
+        corners = [[_index(word) for word in line[1:]] for line in lines if line[:1] == ["f"]]
     except ValueError as error:
         raise refuse(path, "lines 'v x y z' and 'f i j k'", str(error)) from error
     if not rows or not corners or len(corners) > MAX_FACES:
@@ -119,6 +129,14 @@ def read_obj(path: Path) -> Mesh:
     if not (np.abs(vertices) < MAX_COORDINATE).all():
         raise refuse(path, f"finite coordinates below {MAX_COORDINATE:g}", "others")
     return Mesh(vertices=vertices, faces=faces)
+
+
+def _index(word: str) -> int:
+    """The vertex of a face's corner `vertex/texture/normal`."""
+    digits = word.split("/")[0]
+    if len(digits) > MAX_DIGITS or not digits.isascii() or "_" in digits:
+        raise ValueError(f"could not read {digits!r:.40} as an index")
+    return int(digits)
 
 
 def part_of(mesh: Mesh, chosen: Int[np.ndarray, " K"]) -> Mesh:

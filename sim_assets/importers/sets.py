@@ -9,18 +9,21 @@ file that cannot be used is named with the reason and left out; nothing takes it
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from scapo.export.urdf import write_urdf
+from scapo.parallel.pool import AbstractPool, Pool, Report
+from scapo.text import one_line
 from sim_assets.importers import hoi4d, op_align_light, op_align_real, shape2motion
 from sim_assets.importers import partnet_mobility as partnet_models
 from sim_assets.importers.clouds import CloudFile
 from sim_assets.importers.models import Folder, Model
 from sim_assets.importers.splits import CloudReader, SplitWriter, import_split
+from sim_assets.models.limits import bounded
 
 SetName = Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "partnet-mobility"]
 Progress = Callable[[str, int, int], None]
@@ -66,6 +69,18 @@ class Imported:
     """Clouds written."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """How a set is read: nothing here changes what is written."""
+
+    workers: int = 0
+    """Processes; 0: this one, unprotected against files that crash it or never end."""
+    timeout: float = 300.0
+    """Seconds without a sign of life after which a file counts as hanging."""
+    progress: Progress = lambda what, done, total: None
+    """Told what is being read, how many are done, how many there are."""
+
+
 def import_set(
     name: str,
     path: Path,
@@ -73,7 +88,7 @@ def import_set(
     *,
     points: int = 1024,
     strict: bool = False,
-    progress: Progress | None = None,
+    reading: Reading | None = None,
 ) -> Imported:
     """Bring a set into our layout.
 
@@ -84,7 +99,7 @@ def import_set(
             above where one category and split has several. Models: `out/<category>/<id>`.
         points: Of each cloud.
         strict: Raise at the first file that cannot be used.
-        progress: Told what is being read, how many are done, how many there are.
+        reading: How.
 
     Raises:
         ValueError: No such set, nothing of it at `path`, a target that holds something else; with
@@ -97,32 +112,81 @@ def import_set(
         raise ValueError(f"points: expected 1 or more, found {points}")
     result = Imported()
 
-    def refuse(what: str, error: ValueError) -> None:
+    def refuse(what: Path, reason: str) -> None:
+        name, line = one_line(what), one_line(reason)
         if strict:
-            raise error
-        text = " ".join(str(error).split())
-        result.refused[what] = text.removeprefix(f"{what}: ")
+            raise ValueError(line)
+        result.refused[name] = line.removeprefix(f"{name}: ")
 
     if (path.resolve() if path.is_dir() else path.resolve().parent) == out.resolve():
         raise ValueError(f"{out}: expected a folder outside the source, found the source itself")
-    show = progress or (lambda what, done, total: None)
-    if name in MODELS:
-        _models(MODELS[name], path, out, result, (refuse, show))
-    else:
-        _clouds(CLOUDS[name], path, (out, points), result, (refuse, show))
+    reading = reading or Reading()
+    with Pool[Any, Any](reading.workers, timeout=reading.timeout) as pool:
+        calls = pool, refuse, reading.progress
+        if name in MODELS:
+            _models(MODELS[name], path, out, result, calls)
+        else:
+            _clouds(CLOUDS[name], path, (out, points), result, calls)
     return result
 
 
-Calls = tuple[Callable[[str, ValueError], None], Progress]
+Calls = tuple[AbstractPool[Any, Any], Callable[[Path, str], None], Progress]
+"""What reads, what is told of a file that cannot be used, and of how much is done."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelJob:
+    """Read one model in a worker, and write it."""
+
+    read: Callable[[Folder], Model]
+    folder: Folder
+    target: Path
+
+
+def write_model(job: ModelJob, report: Report) -> tuple[Path, tuple[str, ...]]:
+    """The URDF that was written, and what was put right.
+
+    Raises:
+        ValueError: It cannot be used, and why.
+    """
+    report(one_line(job.folder.name), 0)
+    with bounded(job.folder.path):
+        model = job.read(job.folder)
+    return write_urdf(job.target, model.links, model.joints, model.name), model.notes
 
 
 def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls: Calls) -> None:
-    refuse, show = calls
+    pool, refuse, show = calls
     folders = reader.find(path)
+    jobs = _model_jobs(reader, folders, out, lambda folder, why: refuse(folder.path, why))
+    refused = len(folders) - len(jobs)
+    show("models", refused, len(folders))
+    written: dict[Path, tuple[Path, tuple[str, ...]]] = {}
+    for done, outcome in enumerate(pool.run(write_model, jobs), refused + 1):
+        if outcome.result is None:
+            refuse(outcome.job.folder.path, outcome.reason)
+        else:
+            written[outcome.job.target] = outcome.result
+        show("models", done, len(folders))
+    for job in jobs:  # in their order, be one read again or not
+        if job.target in written:
+            urdf, notes = written[job.target]
+            result.written.append(urdf)
+            if notes:
+                result.notes[one_line(job.folder.name)] = notes
+
+
+def _model_jobs(
+    reader: ModelReader,
+    folders: Sequence[Folder],
+    out: Path,
+    refuse: Callable[[Folder, str], None],
+) -> list[ModelJob]:
+    """What to read and where to write it, each in a place of its own outside the source."""
     source = Path(os.path.commonpath([folder.path for folder in folders]))
     seen: dict[Path, str] = {}
-    for done, folder in enumerate(folders):
-        show("models", done, len(folders))
+    jobs = []
+    for folder in folders:
         target = out / folder.category / folder.id
         try:
             if target in seen:
@@ -131,15 +195,12 @@ def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls:
                     f"{seen[target]} too"
                 )
             refuse_inside(target, folder.path, source)
-            model = reader.read(folder)
-            result.written.append(write_urdf(target, model.links, model.joints, model.name))
         except ValueError as error:
-            refuse(str(folder.path), error)
+            refuse(folder, str(error))
             continue
         seen[target] = folder.name
-        if model.notes:
-            result.notes[folder.name] = model.notes
-    show("models", len(folders), len(folders))
+        jobs.append(ModelJob(read=reader.read, folder=folder, target=target))
+    return jobs
 
 
 def refuse_inside(target: Path, *sources: Path) -> None:
@@ -148,30 +209,35 @@ def refuse_inside(target: Path, *sources: Path) -> None:
     Raises:
         ValueError: Naming both.
     """
-    place = target.resolve()
+    place = Path(os.path.realpath(target))
     for source in sources:
-        real = source.resolve()
+        real = Path(os.path.realpath(source))  # a link in a circle is itself
         if place == real or real in place.parents or place in real.parents:
             raise ValueError(f"{target}: expected a place outside the source, found it in {source}")
 
 
 def _clouds(
-    reader: CloudReader, path: Path, wanted: tuple[Path, int], result: Imported, calls: Calls
+    reader: CloudReader,
+    path: Path,
+    wanted: tuple[Path, int],
+    result: Imported,
+    calls: Calls,
 ) -> None:
-    refuse, show = calls
+    pool, refuse, show = calls
     out, points = wanted
     files = sorted(reader.find(path), key=_split_of)
     source = Path(os.path.commonpath([file.path.parent for file in files]))
     several = _several(files)
     done = 0
 
-    def counted(group: list[CloudFile]) -> Iterator[CloudFile]:
+    def on_file(file: CloudFile, reason: str) -> None:
         nonlocal done
-        for file in group:
-            show("clouds", done, len(files))
-            yield file
-            done += 1
+        done += 1
+        show("clouds", done, len(files))
+        if reason:
+            refuse(file.path, reason)
 
+    show("clouds", done, len(files))
     for (category, split, variant), group in groupby(files, key=_split_of):
         members = list(group)
         top = out / variant if (category, split) in several else out
@@ -184,11 +250,10 @@ def _clouds(
             variant=variant,
         )
         refuse_inside(writer.folder, *(file.path for file in members), source)
-        folder = import_split(reader, writer, counted(members), refuse)
+        folder = import_split(reader, writer, members, pool, on_file)
         if folder is not None:
             result.written.append(folder)
             result.samples += writer.count
-    show("clouds", len(files), len(files))
 
 
 def _split_of(file: CloudFile) -> tuple[str, str, str]:

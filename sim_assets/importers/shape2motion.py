@@ -32,7 +32,7 @@ from sim_assets.importers.records import (
     read_obj,
     vector,
 )
-from sim_assets.models.validate import refuse
+from sim_assets.models.validate import read_number, refuse
 
 SET = "shape2motion"
 MESH = "summary.obj"
@@ -189,7 +189,7 @@ def read_labels(path: Path, faces: int, parts: int) -> Int[np.ndarray, " F"]:
     try:
         keys = np.array([_whole(key) for key in table])
         values = np.array([_whole(value) for value in table.values()])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise refuse(path, "whole numbers as faces and parts", str(error)) from error
     order = np.argsort(keys)
     if (np.diff(keys[order]) != 1).any() or len(keys) != faces:
@@ -202,7 +202,7 @@ def read_labels(path: Path, faces: int, parts: int) -> Int[np.ndarray, " F"]:
 
 
 def _whole(value: object) -> int:
-    number = float(np.asarray(value).item() if isinstance(value, np.generic) else value)  # type: ignore[arg-type]
-    if not number.is_integer():
+    found = read_number(value.item() if isinstance(value, np.generic) else value)
+    if not found.is_integer() or abs(found) > 2**53:
         raise ValueError(f"{value!r:.40}")
-    return int(number)
+    return int(found)

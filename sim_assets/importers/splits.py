@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Labelled clouds of other people's sets as splits in our layout (CONTRACT 3).
+"""Labelled clouds of other people's sets as splits in our layout (docs/data-format.md).
 
 Each file of the set is one sample. The points are drawn by a generator that the file's name seeds,
 so a sample does not depend on which other files are there. A split is written beside its place and
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from scapo.categories import CATEGORIES
+from scapo.parallel.pool import AbstractPool, Report
 from scapo.store import SAMPLES, canonical_json, write, write_bytes
 from scapo.store.folders import refuse_foreign, swap
 from scapo.store.manifest import (
@@ -29,9 +30,13 @@ from scapo.store.manifest import (
     read_manifest,
     shards_digest,
 )
+from scapo.text import one_line
 from sim_assets.describe.card import CARD, write_card
+from sim_assets.describe.croissant import CROISSANT
 from sim_assets.formats.archives import read_bytes
 from sim_assets.importers.clouds import CloudFile, RawCloud
+from sim_assets.models.limits import bounded
+from sim_assets.models.validate import refuse
 from sim_assets.sampling.viewpoints import generator
 
 SHARD_SAMPLES = 64
@@ -90,11 +95,10 @@ class SplitWriter:
     def _mine(self) -> tuple[Callable[[Path], bool], str]:
         return partial(made_from, self.set_name), f"data from {self.set_name}"
 
-    def add(self, file: CloudFile, data: bytes, cloud: RawCloud) -> None:
-        """One sample."""
-        row = sample(cloud, self.points, file.name)
+    def add(self, file: CloudFile, sha256: str, row: Row) -> None:
+        """One sample, and the SHA-256 of its file."""
         lines = self.instances.setdefault(file.instance, [])
-        lines.append(f"{file.name} {hashlib.sha256(data).hexdigest()}\n")
+        lines.append(f"{file.name} {sha256}\n")
         row["instance"] = np.array(list(self.instances).index(file.instance), np.int32)
         self.rows.append(row)
         self.count += 1
@@ -172,7 +176,7 @@ def made_from(set_name: str, folder: Path) -> bool:
         manifest = read_manifest(folder / "manifest.json")
     except ManifestError:
         return False
-    own = {"manifest.json", CARD, *(shard.file for shard in manifest.shards)}
+    own = {"manifest.json", CARD, CROISSANT, *(shard.file for shard in manifest.shards)}
     alone = all(path.name in own and not path.is_symlink() for path in folder.iterdir())
     return alone and manifest.options.get("source") == set_name
 
@@ -203,26 +207,61 @@ def sample(cloud: RawCloud, points: int, name: str) -> Row:
     return result
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloudJob:
+    """Read one file in a worker."""
+
+    read: Callable[[CloudFile, bytes], RawCloud]
+    file: CloudFile
+    points: int
+
+
+def read_sample(job: CloudJob, report: Report) -> tuple[str, Row]:
+    """The SHA-256 of a file and its sample.
+
+    Raises:
+        ValueError: It cannot be used, and why.
+    """
+    report(one_line(job.file.name), 0)
+    with bounded(job.file.path):
+        if not job.file.name.isprintable():
+            raise refuse(job.file.path, "names that can be printed", "others")
+        data = read_bytes(job.file.path)
+        row = sample(job.read(job.file, data), job.points, job.file.name)
+    return hashlib.sha256(data).hexdigest(), row
+
+
 def import_split(
     reader: CloudReader,
     writer: SplitWriter,
-    files: Iterable[CloudFile],
-    refuse: Callable[[str, ValueError], None],
+    files: Sequence[CloudFile],
+    pool: AbstractPool[CloudJob, tuple[str, Row]],
+    on_file: Callable[[CloudFile, str], None],
 ) -> Path | None:
-    """Write one split; files that cannot be used are handed to `refuse`, which may raise.
+    """Write one split.
+
+    Args:
+        reader: Of the set.
+        writer: Of the split.
+        files: In the order of its samples.
+        pool: Reads them.
+        on_file: Told of each file when it is done why it could not be used, "" if it could; may
+            raise.
 
     Returns:
         Its folder, or None where no file could be used.
     """
     refused = 0
     with writer:
-        for file in files:
-            try:
-                data = read_bytes(file.path)
-                cloud = reader.read(file, data)
-            except ValueError as error:
-                refused += 1
-                refuse(str(file.path), error)
-                continue
-            writer.add(file, data, cloud)
+        for start in range(0, len(files), SHARD_SAMPLES):
+            chunk = files[start : start + SHARD_SAMPLES]
+            jobs = [CloudJob(read=reader.read, file=f, points=writer.points) for f in chunk]
+            outcomes = {outcome.job.file.path: outcome for outcome in pool.run(read_sample, jobs)}
+            for file in chunk:  # in their order, be one read again or not
+                result = outcomes[file.path].result
+                if result is None:
+                    refused += 1
+                else:
+                    writer.add(file, *result)
+                on_file(file, outcomes[file.path].reason)
         return writer.finish(refused) if writer.count else None

@@ -15,19 +15,22 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from scapo.categories import JointKind, JointSpec
 from scapo.parallel.pool import Outcome, Pool, Report
 from scapo.store.files import write_bytes
-from scapo.types import JointKind, JointSpec
+from scapo.text import one_line
 from sim_assets.generation.request import make_request
+from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.joints import Candidate, candidates
 from sim_assets.models.library import find, source_root
+from sim_assets.models.limits import bounded, limited_memory
 from sim_assets.models.reader import Model, load, read
 from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.validate import AssetError, Repairs, refuse
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import make_renderer
-from sim_assets.sampling.samples import Shooter, ViewError
+from sim_assets.sampling.samples import SampleMaker, ViewError
 
 FORMAT = "scapo-check/1"
 Status = Literal["accepted", "repaired", "refused"]
@@ -42,10 +45,12 @@ class Options:
     up: str | None = None
     front: str | None = None
     scale: float | None = None
+    any_model: bool = False
+    """Whether a model none of whose names speaks of the category is accepted."""
     timeout: float = 120.0
     """Seconds for one model."""
     memory: int = 4 << 30
-    """Bytes for one model."""
+    """Bytes for one model, to read it and to show it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +65,8 @@ class Result:
     repairs: tuple[str, ...] = ()
     joints: tuple[str, ...] = ()
     """Joints that a category can use; with a category given, those chosen."""
+    account: tuple[str, ...] = ()
+    """With a category given: which joints were taken, what the size is, and the repairs."""
     triangles: int = 0
 
 
@@ -131,14 +138,15 @@ def exit_code(results: Iterable[Result]) -> int:
 
 def _job(model: _Model, send: Report) -> Result:
     """In the worker."""
-    limit_memory(model.options.memory)
-    send(str(model.urdf), 0)
-    return check_one(model.urdf, model.root, model.options)
+    send(one_line(model.urdf), 0)
+    with limited_memory(model.options.memory):
+        return check_one(model.urdf, model.root, model.options)
 
 
 def _result(outcome: Outcome[_Model, Result]) -> Result:
     model = outcome.job
-    name = model.urdf.resolve().relative_to(model.root.resolve()).as_posix()
+    folder = model.urdf.parent.resolve()  # the file itself may be a link to anywhere
+    name = one_line((folder / model.urdf.name).relative_to(model.root.resolve()).as_posix())
     result = outcome.result
     if result is None:
         reason = f"{name}: expected to be read, found that {outcome.reason}"
@@ -146,27 +154,10 @@ def _result(outcome: Outcome[_Model, Result]) -> Result:
     return replace(result, path=name, reason=result.reason.replace(f"{model.root}/", ""))
 
 
-def limit_memory(extra: int) -> None:
-    """Let this process take `extra` bytes more than it has now; beyond it memory errors arise.
-
-    Does nothing where the system has no such limit (Windows) or does not tell its size (macOS).
-    """
-    try:
-        import resource
-
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-    except (ImportError, OSError):
-        return
-    _, hard = resource.getrlimit(resource.RLIMIT_AS)
-    wanted = pages * resource.getpagesize() + extra
-    if hard != resource.RLIM_INFINITY:
-        wanted = min(wanted, hard)
-    resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
-
-
 def check_one(urdf: Path, root: Path, options: Options) -> Result:
     """Check one model in this process; refusals are results, other errors are raised."""
     repairs = Repairs()
+    told: tuple[str, ...] = ()
     try:
         if options.category is None:
             joints, triangles = _general(urdf, root, repairs)
@@ -180,14 +171,24 @@ def check_one(urdf: Path, root: Path, options: Options) -> Result:
                 scale=options.scale,
                 root=root,
             )
+            if not options.any_model:
+                check_speaks(urdf, thing)
             show(urdf, thing)
+            told = sentences(thing)
             joints, said = thing.origin.joint_names, thing.origin.repairs
             triangles = sum(len(visual.mesh.faces) for part in thing.visuals for visual in part)
     except AssetError as error:
         reason, said = str(error), repairs.sentences()
         return Result(path=str(urdf), status="refused", reason=reason, repairs=said)
     status: Status = "repaired" if said else "accepted"
-    return Result(path=str(urdf), status=status, repairs=said, joints=joints, triangles=triangles)
+    return Result(
+        path=str(urdf),
+        status=status,
+        repairs=said,
+        joints=joints,
+        account=told,
+        triangles=triangles,
+    )
 
 
 def show(urdf: Path, thing: ArticulatedObject) -> None:
@@ -199,7 +200,7 @@ def show(urdf: Path, thing: ArticulatedObject) -> None:
     request, _ = make_request(thing.category.name, DataOptions(count=1, backend="raycast"))
     with make_renderer("raycast") as renderer:
         try:
-            list(Shooter(renderer, thing, request.settings).shots([("check",)]))
+            list(SampleMaker(renderer, thing, request.settings).render_views([("check",)]))
         except ViewError as error:
             reason = str(error).removeprefix(f"{thing.instance}: expected ")
             raise AssetError(f"{urdf}: expected {reason}") from error
@@ -207,8 +208,12 @@ def show(urdf: Path, thing: ArticulatedObject) -> None:
 
 def _general(urdf: Path, root: Path, repairs: Repairs) -> tuple[tuple[str, ...], int]:
     """Joints that some category could use, and the number of triangles."""
-    model = load(SourceFiles(urdf=urdf, root=root, repairs=repairs))
-    surfaces = model.surfaces
+    with bounded(urdf):
+        return _found(load(SourceFiles(urdf=urdf, root=root, repairs=repairs)))
+
+
+def _found(model: Model) -> tuple[tuple[str, ...], int]:
+    urdf, surfaces = model.robot.path, model.surfaces
     found, reasons = [], []
     for kind in get_args(JointKind):
         spec = JointSpec(kind=kind, parent=0, child=1, lower=0.0, upper=math.pi)

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from scapo.types import Category
+from scapo.categories import Category
 from sim_assets.models.validate import Repairs, refuse
 
 AXES = ("x", "y", "z")

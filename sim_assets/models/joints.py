@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""From a model with any joints to its category's joints and parts (CONTRACT 1).
+"""From a model with any joints to its category's joints, parts and rest (docs/data-format.md).
 
-The rule: of the joints of the right kind with real travel, those whose link is named as the
-category's moving part (`Category.words`; by the source's semantics, else by link and joint names)
-go before the others, limited ones before continuous ones, those that do not mimic before those
-that do; within a class the largest swept surface wins. Swept surface: the sum over the triangles
-that the joint moves of area times the length of the centre's path over the travel, that is the
-area times its mean displacement. All other joints stay at rest, and their links belong to the
-part they hang on.
+`reduce` chooses the joints: of those of the right kind with real travel, those whose link is named
+as the category's moving part (`Category.words`; by the source's semantics, else by link and joint
+names) go before the others, limited ones before continuous ones, those that do not mimic before
+those that do; within a class the largest swept surface wins. Swept surface: the sum over the
+triangles that the joint moves of area times the length of the centre's path over the travel, that
+is the area times its mean displacement. All other joints stay at rest, and their links belong to
+the part they hang on.
 
-Where a model's joints are at rest, which way they open, and how far (CONTRACT 1).
-
-Zero has no fixed meaning in the wild: one laptop is open at 0, another closed, a fridge stands half
-open. So the limits are scanned for the state that `Category.rest` describes:
+`find_rest` tells where they rest, which way they open, and how far. Zero has no fixed meaning in
+the wild: one laptop is open at 0, another closed, a fridge stands half open. So the limits are
+scanned for the state that `Category.rest` describes:
 
 - "smallest-box" (closed lids, doors, drawers, blades) and "largest-box" (unfolded temples): the
   surface area of the convex hull of the whole object is smallest, or largest. The hull is the
@@ -37,7 +36,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-from scapo.types import Category, JointSpec
+from scapo.categories import Category, JointSpec
 from sim_assets.models.robot import Joint, Robot
 from sim_assets.models.sources import Traits
 from sim_assets.models.validate import AssetError, check_movable, kinds, refuse

@@ -16,6 +16,8 @@ SHARES = {"train": 0.7, "val": 0.1, "test": 0.2}
 """By hash of the instance id, where the source has no splits of its own."""
 FEW = 10
 """Fewer models than this are not divided."""
+MAX_ID = 240
+"""Characters of an instance id: with an ending it still is the name of a file."""
 INNER = ("urdf", "urdfs", "robots")
 """Folders in which a package keeps its URDFs, the meshes beside them."""
 PREFERRED = ("mobility.urdf", "model.urdf", "robot.urdf")
@@ -90,9 +92,10 @@ def instance_id(urdf: Path, root: Path) -> str:
     """The model's folder relative to the source folder, as one safe word.
 
     Where the file's name tells models apart (several in one folder) it is added. A word that
-    had to be changed, and so might be another's too, ends in a hash of the original.
+    had to be changed or cut, and so might be another's too, ends in a hash of the original. The
+    folder is that in which the file's name stands, be it a link.
     """
-    folder = urdf.resolve().parent
+    folder = urdf.parent.resolve()
     relative = folder.relative_to(root.resolve())
     pieces = list(relative.parts) or [folder.name]
     if len(pieces) == 1 and folder.name in INNER:  # says nothing: the package's name
@@ -101,8 +104,9 @@ def instance_id(urdf: Path, root: Path) -> str:
         pieces.append(urdf.stem)
     word = "-".join(pieces)
     safe = re.sub(r"[^A-Za-z0-9._-]+", "_", word).strip(".") or "model"
-    if safe != word or (len(pieces) > 1 and any("-" in piece for piece in pieces)):
-        mark = hashlib.sha256("/".join(pieces).encode()).hexdigest()[:8]
+    doubtful = safe != word or (len(pieces) > 1 and any("-" in piece for piece in pieces))
+    if doubtful or len(safe) > MAX_ID:
+        mark = hashlib.sha256(os.fsencode("/".join(pieces))).hexdigest()[:8]
         safe = f"{safe[:80]}-{mark}"
     return safe
 
@@ -139,7 +143,7 @@ def select(paths: Sequence[Path], split: str, root: Path) -> list[Path]:
 
 
 def _own_split(path: Path, root: Path) -> str | None:
-    parts = path.resolve().relative_to(root.resolve()).parts[:-1]
+    parts = path.parent.resolve().relative_to(root.resolve()).parts
     return next((part for part in parts if part in SPLITS), None)
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The visual shapes of a link as surfaces in the link's coordinates, checked and two-sided.
 
-URDF primitives as fine closed meshes: SAPIEN's own are off by millimetres (RENDERING 2).
+URDF primitives as fine closed meshes: SAPIEN's own are off by millimetres.
 """
 
 from __future__ import annotations
@@ -18,41 +18,14 @@ from jaxtyping import Float, Int
 from trimesh.visual import ColorVisuals, TextureVisuals
 
 from sim_assets.models.resolver import MeshResolver, SourceFiles
-from sim_assets.models.robot import Color, Link, Robot, Shape, ShapeKind
+from sim_assets.models.robot import Color, Robot, Shape, ShapeKind
 from sim_assets.models.sides import two_sided
-from sim_assets.models.textures import find_image, is_readable
+from sim_assets.models.textures import find_image, is_readable, only_pictures
 from sim_assets.models.validate import MAX_COORDINATE, MAX_FACES, AssetError, check_mesh, refuse
 from sim_assets.objects import Visual
 
 SAGITTA = 5e-5
 """Largest distance of the mesh from the true surface, relative to the radius."""
-
-
-def solid(kind: ShapeKind, size: tuple[float, ...]) -> trimesh.Trimesh:
-    """A box, cylinder, sphere or capsule about the origin, axis z, as URDF defines them.
-
-    Args:
-        kind: Not "mesh".
-        size: As in `Shape.size`.
-    """
-    if kind == "box":
-        return trimesh.creation.box(extents=size)
-    if kind == "sphere":
-        return trimesh.creation.icosphere(subdivisions=5, radius=size[0])
-    sections = math.ceil(math.pi / math.acos(1 - SAGITTA) / 4) * 4
-    radius, length = size
-    if kind == "cylinder":
-        return trimesh.creation.cylinder(radius=radius, height=length, sections=sections)
-    # trimesh sets a capsule's lower centre on the origin in some versions: built by revolution.
-    turn = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 2)
-    outline = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
-    half = len(outline) // 2
-    outline[:half, 1] -= length / 2
-    outline[half:, 1] += length / 2
-    outline[[0, -1], 0] = 0.0
-    return trimesh.creation.revolve(outline, sections=sections)
-
-
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
 GREY: Color = (0.7, 0.7, 0.7, 1.0)
 
@@ -64,33 +37,34 @@ def load_links(robot: Robot, files: SourceFiles) -> dict[str, tuple[Visual, ...]
         AssetError: A mesh is missing, broken, empty, outside the source folder, or all together
             are too large.
     """
-    cache: dict[Path, list[Visual]] = {}
+    cache: dict[object, list[Visual]] = {}
     result: dict[str, tuple[Visual, ...]] = {}
     faces = 0
     for link in robot.links.values():
-        visuals = _load_link(link, files, cache)
-        faces += sum(len(visual.mesh.faces) for visual in visuals)
-        if faces > MAX_FACES:
-            raise refuse(robot.path, f"at most {MAX_FACES} triangles", "more")
+        visuals: list[Visual] = []
+        for shape in link.shapes:
+            pieces = _load_shape(shape, files, cache)
+            faces += sum(len(piece.mesh.faces) for piece in pieces)
+            if faces > MAX_FACES:  # before the many are placed that share what was loaded
+                raise refuse(robot.path, f"at most {MAX_FACES} triangles", "more")
+            visuals += [_placed(piece, shape, files, f"link {link.name!r}") for piece in pieces]
         if visuals:
-            result[link.name] = visuals
+            result[link.name] = tuple(visuals)
+    if not result:
+        raise refuse(robot.path, "triangles in some link", "none")
     return result
 
 
-def _load_link(
-    link: Link, files: SourceFiles, cache: dict[Path, list[Visual]]
-) -> tuple[Visual, ...]:
-    visuals: list[Visual] = []
-    for shape in link.shapes:
-        if shape.kind == "mesh":
-            path = files.locate(shape.filename)
-            if path not in cache:
-                cache[path] = load_mesh(path, files)
-            pieces = cache[path]
+def _load_shape(
+    shape: Shape, files: SourceFiles, cache: dict[object, list[Visual]]
+) -> list[Visual]:
+    key = files.locate(shape.filename) if shape.kind == "mesh" else (shape.kind, shape.size)
+    if key not in cache:
+        if isinstance(key, Path):
+            cache[key] = load_mesh(key, files)
         else:
-            pieces = [Visual(mesh=solid(shape.kind, shape.size), color=GREY)]
-        visuals += [_placed(piece, shape, files, f"link {link.name!r}") for piece in pieces]
-    return tuple(visuals)
+            cache[key] = [Visual(mesh=solid(shape.kind, shape.size), color=GREY)]
+    return cache[key]
 
 
 def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
@@ -105,6 +79,8 @@ def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
     data = files.read(path)
     if not data.strip():
         raise refuse(path, "a mesh", "an empty file")
+    if _claimed_faces(form, data) > MAX_FACES:
+        raise refuse(path, f"at most {MAX_FACES} triangles", "more")
     pieces, units = _parse(path, form, data, MeshResolver(files, path))
     if not pieces:
         raise refuse(path, "a mesh with triangles", "none")
@@ -113,10 +89,22 @@ def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
     return _both_sides(pieces, _unit(units))
 
 
+def _claimed_faces(form: str, data: bytes) -> int:
+    """How many faces a file says that it has; 0 where that takes parsing."""
+    if form == "obj":
+        return data.count(b"\nf ")
+    if form == "stl":
+        claimed = int.from_bytes(data[80:84], "little")
+        return claimed if len(data) == 84 + 50 * claimed else data.count(b"endfacet")
+    found = re.search(rb"^element face (\d{1,18})\s", data[:65536], re.MULTILINE)
+    return int(found[1]) if form == "ply" and found else 0
+
+
 def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[list[Visual], str]:
     """Pieces in the scene's frame, and its units; whatever a loader raises is a refusal."""
+    where, repairs = resolver.mesh.name, resolver.files.repairs
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), only_pictures(lambda why: repairs.add(why, where)):
             warnings.simplefilter("ignore")
             scene = trimesh.load_scene(
                 io.BytesIO(data), file_type=form, resolver=resolver, process=False
@@ -129,6 +117,8 @@ def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[
     except ImportError as error:
         package = {"dae": "pycollada"}.get(form, str(error.name))
         raise refuse(path, f"the package {package} to read it", "it is not installed") from error
+    except RecursionError as error:
+        raise refuse(path, f"a valid {form} file", "nodes nested too deeply") from error
     except Exception as error:
         raise refuse(path, f"a valid {form} file", f"{type(error).__name__}: {error}") from error
 
@@ -204,7 +194,7 @@ def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visu
             faces = faces[:, ::-1]
     pose = shape.link_T_shape
     moved = vertices @ pose[:3, :3].T + pose[:3, 3]
-    if np.abs(moved[np.unique(faces)]).max() > MAX_COORDINATE:
+    if not (np.abs(moved[np.unique(faces)]) <= MAX_COORDINATE).all():
         raise refuse(files.urdf, f"{where}: coordinates below {MAX_COORDINATE:g}", "larger ones")
     mesh = remade(piece.mesh, moved, faces)
     if shape.color is None:
@@ -221,3 +211,28 @@ def remade(
     if isinstance(mesh.visual, TextureVisuals):
         result.visual = TextureVisuals(uv=mesh.visual.uv, material=mesh.visual.material)
     return result
+
+
+def solid(kind: ShapeKind, size: tuple[float, ...]) -> trimesh.Trimesh:
+    """A box, cylinder, sphere or capsule about the origin, axis z, as URDF defines them.
+
+    Args:
+        kind: Not "mesh".
+        size: As in `Shape.size`.
+    """
+    if kind == "box":
+        return trimesh.creation.box(extents=size)
+    if kind == "sphere":
+        return trimesh.creation.icosphere(subdivisions=5, radius=size[0])
+    sections = math.ceil(math.pi / math.acos(1 - SAGITTA) / 4) * 4
+    radius, length = size
+    if kind == "cylinder":
+        return trimesh.creation.cylinder(radius=radius, height=length, sections=sections)
+    # trimesh sets a capsule's lower centre on the origin in some versions: built by revolution.
+    turn = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 2)
+    outline = np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1)
+    half = len(outline) // 2
+    outline[:half, 1] -= length / 2
+    outline[half:, 1] += length / 2
+    outline[[0, -1], 0] = 0.0
+    return trimesh.creation.revolve(outline, sections=sections)

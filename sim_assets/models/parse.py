@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """From URDF elements to a `Robot`, repairing what has one meaning and refusing the rest.
 
-Which link is the root, the joints from it outwards, and links that hang loose.
+`parse` reads the elements; `build_robot` finds the root among the links and orders the joints from
+it outwards.
 """
 
 from __future__ import annotations
@@ -34,75 +35,10 @@ from sim_assets.models.validate import (
     Repairs,
     check_mimics,
     check_tree,
+    read_number,
     refuse,
 )
 from sim_assets.models.xml import Element, children, local, read_xml
-
-
-def build_robot(
-    path: Path, name: str, links: dict[str, Link], joints: dict[str, Joint], repairs: Repairs
-) -> Robot:
-    """A robot from its links and joints in any order.
-
-    Raises:
-        AssetError: They make no single tree.
-    """
-    check_tree(path, links, joints.values())
-    root = _root(path, links, joints, repairs)
-    ordered = {joint.name: joint for joint in _outwards(root, joints)}
-    reached = (root, *(joint.child for joint in ordered.values()))
-    robot = Robot(
-        path=path,
-        name=name,
-        links={link: links[link] for link in reached},
-        joints=ordered,
-        root=root,
-    )
-    _hold_loose(robot, repairs)
-    return robot
-
-
-def _root(path: Path, links: dict[str, Link], joints: dict[str, Joint], repairs: Repairs) -> str:
-    hung = {joint.child for joint in joints.values()}
-    parents = {joint.parent for joint in joints.values()}
-    roots = [name for name in links if name not in hung]
-    used = [name for name in roots if name in parents or links[name].shapes]
-    if len(used) > 1:
-        listed = ", ".join(repr(name) for name in used[:4])
-        raise refuse(path, "one root link", f"{len(used)}: {listed}")
-    kept = used or roots[:1]
-    for name in roots:
-        if name not in kept:
-            repairs.add("An empty link that nothing hangs on was dropped", f"link {name!r}")
-    return kept[0]
-
-
-def _outwards(root: str, joints: dict[str, Joint]) -> Iterator[Joint]:
-    """Breadth first, in file order within a link."""
-    below: dict[str, list[Joint]] = {}
-    for joint in joints.values():
-        below.setdefault(joint.parent, []).append(joint)
-    links = [root]
-    for link in links:
-        for joint in below.get(link, ()):
-            yield joint
-            links.append(joint.child)
-
-
-def _hold_loose(robot: Robot, repairs: Repairs) -> None:
-    """A free joint may hang the whole object in the world; it may not hold a piece of it."""
-    solid = {name for name, link in robot.links.items() if link.shapes}
-    for joint in robot.joints.values():
-        if joint.kind not in ("floating", "planar"):
-            continue
-        below = robot.subtree(joint)
-        if solid & below and solid - below:
-            raise refuse(
-                robot.path,
-                "joints that are revolute, continuous, prismatic or fixed",
-                f"the {joint.kind} joint {joint.name!r} between visible links",
-            )
-        repairs.add(f"A {joint.kind} joint was held at its origin", f"joint {joint.name!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +63,7 @@ class _Reader:
         text = (text or "").strip()
         words = text.replace(",", " ").replace(";", " ").split()
         try:
-            values = tuple(float(word) for word in words)
+            values = tuple(read_number(word) for word in words)
         except ValueError as error:
             raise self.error(where, "numbers", repr(text)) from error
         if len(values) not in counts:
@@ -360,3 +296,69 @@ def _mimic(reader: _Reader, element: Element, kind: str, where: str) -> Mimic | 
         multiplier=reader.one(found.get("multiplier", "1"), f"{where} mimic"),
         offset=reader.one(found.get("offset", "0"), f"{where} mimic"),
     )
+
+
+def build_robot(
+    path: Path, name: str, links: dict[str, Link], joints: dict[str, Joint], repairs: Repairs
+) -> Robot:
+    """A robot from its links and joints in any order.
+
+    Raises:
+        AssetError: They make no single tree.
+    """
+    check_tree(path, links, joints.values())
+    root = _root(path, links, joints, repairs)
+    ordered = {joint.name: joint for joint in _outwards(root, joints)}
+    reached = (root, *(joint.child for joint in ordered.values()))
+    robot = Robot(
+        path=path,
+        name=name,
+        links={link: links[link] for link in reached},
+        joints=ordered,
+        root=root,
+    )
+    _hold_loose(robot, repairs)
+    return robot
+
+
+def _root(path: Path, links: dict[str, Link], joints: dict[str, Joint], repairs: Repairs) -> str:
+    hung = {joint.child for joint in joints.values()}
+    parents = {joint.parent for joint in joints.values()}
+    roots = [name for name in links if name not in hung]
+    used = [name for name in roots if name in parents or links[name].shapes]
+    if len(used) > 1:
+        listed = ", ".join(repr(name) for name in used[:4])
+        raise refuse(path, "one root link", f"{len(used)}: {listed}")
+    kept = used or roots[:1]
+    for name in roots:
+        if name not in kept:
+            repairs.add("An empty link that nothing hangs on was dropped", f"link {name!r}")
+    return kept[0]
+
+
+def _outwards(root: str, joints: dict[str, Joint]) -> Iterator[Joint]:
+    """Breadth first, in file order within a link."""
+    below: dict[str, list[Joint]] = {}
+    for joint in joints.values():
+        below.setdefault(joint.parent, []).append(joint)
+    links = [root]
+    for link in links:
+        for joint in below.get(link, ()):
+            yield joint
+            links.append(joint.child)
+
+
+def _hold_loose(robot: Robot, repairs: Repairs) -> None:
+    """A free joint may hang the whole object in the world; it may not hold a piece of it."""
+    solid = {name for name, link in robot.links.items() if link.shapes}
+    for joint in robot.joints.values():
+        if joint.kind not in ("floating", "planar"):
+            continue
+        below = robot.subtree(joint)
+        if solid & below and solid - below:
+            raise refuse(
+                robot.path,
+                "joints that are revolute, continuous, prismatic or fixed",
+                f"the {joint.kind} joint {joint.name!r} between visible links",
+            )
+        repairs.add(f"A {joint.kind} joint was held at its origin", f"joint {joint.name!r}")

@@ -4,8 +4,9 @@
     for urdf in select(find(source), "train", root=source):
         thing = read(urdf, "oven", root=source)
 
-`read` does one model: parse and repair (`parse`), surfaces (`meshes`), the category's joints
-(`reduce`), their rest (`rest`), the object frame (`frames`), final checks (`validate`).
+`read` does one model: parse and repair (`parse`), surfaces (`meshes`), the category's joints and
+their rest (`joints`), the object frame (`frames`), final checks (`validate`); all of it within the
+memory and time that `limits` allows.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import trimesh
 from jaxtyping import Float
 from trimesh.visual import TextureVisuals
 
+from scapo.categories import Category
 from scapo.categories import category as find_category
-from scapo.types import Category
 from sim_assets.models import frames
+from sim_assets.models.account import account
 from sim_assets.models.frames import Vector
 from sim_assets.models.joints import (
     Reduction,
@@ -33,13 +35,14 @@ from sim_assets.models.joints import (
     reordered,
 )
 from sim_assets.models.library import INNER, find, instance_id, select
+from sim_assets.models.limits import bounded
 from sim_assets.models.meshes import load_links, remade
 from sim_assets.models.parse import parse
 from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.robot import Robot
 from sim_assets.models.sources import Traits, traits
-from sim_assets.models.validate import Repairs, check_object, check_robot, refuse
-from sim_assets.objects import ArticulatedObject, Origin, Visual
+from sim_assets.models.validate import Repairs, check_object, check_poses, check_robot, refuse
+from sim_assets.objects import Account, ArticulatedObject, Origin, Visual
 
 __all__ = ["find", "instance_id", "read", "select"]
 
@@ -109,7 +112,14 @@ def read(
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise refuse(urdf, "a scale above zero", f"{scale}")
     files = SourceFiles(urdf=urdf, root=root or package_root(urdf), repairs=Repairs())
-    model = load(files)
+    with bounded(urdf):
+        return _read(files, spec, up, front, scale)
+
+
+def _read(
+    files: SourceFiles, spec: Category, up: str | None, front: str | None, scale: float | None
+) -> ArticulatedObject:
+    urdf, model = files.urdf, load(files)
     upward = frames.direction(up or model.known.up, urdf)
     reduction = reduce(model.robot, model.surfaces, spec, model.known)
     rests = find_rest(model.robot, model.surfaces, reduction, spec, upward)
@@ -136,12 +146,16 @@ def load(files: SourceFiles) -> Model:
     """
     if not files.is_inside(files.urdf):
         raise refuse(files.urdf, f"a file inside the folder {files.root.name!r}", "one outside")
-    robot = parse(files.urdf, files.repairs)
-    known = traits(robot)
-    check_robot(files.urdf, robot, known.remark)
-    for file in (files.urdf, *known.files):
-        files.read(file)
-    return Model(robot=robot, surfaces=load_links(robot, files), known=known)
+    if not all(part.isprintable() for part in files.urdf.parts[len(files.root.parts) :]):
+        raise refuse(files.urdf, "names that can be printed", "others")
+    with bounded(files.urdf):
+        robot = parse(files.urdf, files.repairs)
+        known = traits(robot)
+        check_robot(files.urdf, robot, known.remark)
+        check_poses(files.urdf, robot.poses({}))
+        for file in (files.urdf, *known.files):
+            files.read(file)
+        return Model(robot=robot, surfaces=load_links(robot, files), known=known)
 
 
 def package_root(urdf: Path) -> Path:
@@ -263,8 +277,18 @@ def _object(
             joint_names=tuple(joint.name for joint in joints),
             sign=tuple(rest.direction for rest in resting.rests),
             repairs=files.repairs.sentences(),
+            account=_told(resting, category, visuals, ratio),
         ),
     )
+
+
+def _told(
+    resting: _Resting, category: Category, parts: tuple[tuple[Visual, ...], ...], ratio: float
+) -> Account:
+    bounds = np.concatenate([visual.mesh.bounds for part in parts for visual in part])
+    sides = bounds.max(0) - bounds.min(0)
+    model = resting.model
+    return account(model.robot, model.known, resting.reduction, category, sides, ratio)
 
 
 def _moved(visual: Visual, a_T_b: Pose) -> Visual:

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from trimesh.resolvers import Resolver
 
-from sim_assets.models.validate import MAX_MESH_BYTES, Repairs, refuse
+from sim_assets.models.validate import MAX_MESH_BYTES, Repairs, read_file, refuse
 
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+)://?(.*)$", re.DOTALL)
 _DRIVE = re.compile(r"^[A-Za-z]:[/\\]")
@@ -57,13 +57,7 @@ class SourceFiles:
         Raises:
             AssetError: Unreadable or too large.
         """
-        try:
-            size = path.stat().st_size
-            if size > MAX_MESH_BYTES:
-                raise refuse(path, f"at most {MAX_MESH_BYTES >> 20} MiB", f"{size >> 20} MiB")
-            data = path.read_bytes()
-        except OSError as error:
-            raise refuse(path, "a readable file", str(error.strerror)) from error
+        data = read_file(path, MAX_MESH_BYTES)
         relative = path.resolve().relative_to(self.root.resolve()).as_posix()
         self.hashes[relative] = hashlib.sha256(data).hexdigest()
         return data
@@ -119,8 +113,11 @@ class SourceFiles:
         return None
 
     def is_inside(self, path: Path) -> bool:
-        """Whether a path, links followed, lies below the root."""
-        return self.root.resolve() in path.resolve().parents
+        """Whether a path, links followed, lies below the root; not for links in a circle."""
+        try:
+            return self.root.resolve() in path.resolve().parents
+        except (OSError, RuntimeError):
+            return False
 
     def _inside(self, path: Path, name: str) -> Path:
         if not self.is_inside(path):
@@ -140,6 +137,8 @@ class MeshResolver(Resolver):
         clean = PurePosixPath(str(key).strip().replace("\\", "/"))
         path = self.mesh.parent / clean
         if "\0" in str(clean) or not self.files.is_inside(path) or not path.is_file():
+            if clean.suffix.lower() != ".mtl":
+                self.files.repairs.add("A file that a mesh names is not there", str(key))
             raise FileNotFoundError(str(key))
         return self.files.read(path)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from scapo.store.regular import read_regular
 from sim_assets.models.robot import Robot, transform
 
 MAX_BYTES = 4 << 20
@@ -101,8 +102,6 @@ def _remark(path: Path) -> str:
 
 def _text(path: Path) -> str | None:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            return None
-        return path.read_text(errors="replace")
+        return read_regular(path, MAX_BYTES).decode(errors="replace")
     except OSError:
         return None

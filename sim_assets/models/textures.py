@@ -9,9 +9,12 @@ factor is multiplied in, as that format says.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+import PIL.Image
 from jaxtyping import Float, Int, UInt8
 from PIL.Image import Image
 from trimesh.visual import TextureVisuals
@@ -21,6 +24,10 @@ from sim_assets.objects import Visual
 
 MAX_TEXELS = 1 << 26
 """Of a texture: 8192 x 8192."""
+FORMATS = ("PNG", "JPEG", "BMP", "TGA", "WEBP", "GIF")
+"""Of textures, told by their content: Pillow knows formats that are programs (EPS is PostScript,
+which it hands to Ghostscript). Of an animation the first picture counts."""
+LEFT_OUT = f"A texture was left out that is none of {', '.join(FORMATS)}, or is damaged"
 
 Texels = UInt8[np.ndarray, "H W 3"]
 
@@ -32,6 +39,33 @@ def find_image(material: object) -> Image | None:
         if isinstance(image, Image):
             return image
     return None
+
+
+@contextmanager
+def only_pictures(on_left_out: Callable[[str], None]) -> Iterator[None]:
+    """While mesh loaders run, which open pictures themselves: refuse all but `FORMATS`, small ones.
+
+    Args:
+        on_left_out: Told why, for each picture that a loader is refused; it goes on without.
+    """
+    before = PIL.Image.open
+
+    def opened(file: Any, mode: Any = "r", formats: object = None) -> Image:  # noqa: ANN401
+        del formats
+        try:
+            image = before(file, mode, FORMATS)
+            if not 0 < image.width * image.height <= MAX_TEXELS:
+                raise ValueError(f"{image.width} x {image.height} texels")
+        except Exception:
+            on_left_out(LEFT_OUT)
+            raise
+        return image
+
+    PIL.Image.open = opened
+    try:
+        yield
+    finally:
+        PIL.Image.open = before
 
 
 def is_readable(image: Image) -> bool:

@@ -8,7 +8,8 @@ what was expected and what was found.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import errno
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from scapo.store.regular import read_regular
+from scapo.text import one_line
 from sim_assets.models.robot import MOVABLE, Joint, Robot
 from sim_assets.objects import ArticulatedObject
 
@@ -23,6 +26,10 @@ MAX_URDF_BYTES = 32 << 20
 MAX_MESH_BYTES = 512 << 20
 MAX_LINKS = 5000
 MAX_SHAPES = 20000
+MAX_CHAIN = 64
+"""Joints that mimic one another in a row."""
+MAX_WORDS = 300
+"""Characters of what was expected, and of what was found."""
 MAX_FACES = 5_000_000
 """Triangles of a whole asset: a 2.6 million triangle STL still loads in seconds."""
 MAX_COORDINATE = 1e5
@@ -34,8 +41,41 @@ class AssetError(ValueError):
 
 
 def refuse(path: Path, expected: str, found: str) -> AssetError:
-    """The error to raise, worded alike everywhere."""
-    return AssetError(f"{path}: expected {expected}, found {found}")
+    """The error to raise, worded alike everywhere; one line, however long a value is."""
+    words = (one_line(text, MAX_WORDS) for text in (expected, found))
+    return AssetError(one_line(path, 2 * MAX_WORDS) + ": expected {}, found {}".format(*words))
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """The bytes of a regular file of at most `limit` bytes.
+
+    Raises:
+        AssetError: No such file, another kind of file, or a larger one.
+    """
+    try:
+        return read_regular(path, limit)
+    except OSError as error:
+        if error.errno == errno.EFBIG:
+            raise refuse(path, f"at most {limit >> 20} MiB", "more") from error
+        raise refuse(path, "a readable file", str(error.strerror)) from error
+    except ValueError as error:
+        raise refuse(path, "the name of a file", str(error)) from error
+
+
+def read_number(word: object) -> float:
+    """A number as files have it: ASCII digits, without the underscores that Python takes.
+
+    Raises:
+        ValueError: It is none, or larger than a float can be.
+    """
+    if isinstance(word, str) and (not word.isascii() or "_" in word):
+        raise ValueError(f"could not read {word!r:.40} as a number")
+    if isinstance(word, bool) or not isinstance(word, str | int | float | np.number):
+        raise ValueError(f"expected a number, found {type(word).__name__}")
+    try:
+        return float(word)
+    except OverflowError as error:
+        raise ValueError("a number of too many digits") from error
 
 
 @dataclass(slots=True)
@@ -109,8 +149,23 @@ def check_mimics(path: Path, joints: dict[str, Joint]) -> None:
                 raise refuse(
                     path, "a mimicked joint that leads", f"a cycle of mimics at {master.name!r}"
                 )
+            if len(seen) > MAX_CHAIN:
+                found = f"more at {joint.name!r}"
+                raise refuse(path, f"at most {MAX_CHAIN} mimics in a row", found)
             seen.add(master.name)
             current = master
+
+
+def check_poses(path: Path, poses: Mapping[str, Float[np.ndarray, "4 4"]]) -> None:
+    """Links lie where float64 can still tell millimetres.
+
+    Raises:
+        AssetError: Naming the first link that is far away or nowhere.
+    """
+    for name, pose in poses.items():
+        if not (np.abs(pose) < MAX_COORDINATE).all():
+            found = f"link {name!r} at {pose[:3, 3].tolist()}"
+            raise refuse(path, f"links at coordinates below {MAX_COORDINATE:g}", found)
 
 
 def check_movable(path: Path, joint: Joint, sizes: Float[np.ndarray, " 2"]) -> None:
@@ -154,9 +209,11 @@ def check_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
             f"vertex indices below {len(mesh.vertices)}",
             f"{mesh.faces.min()} to {mesh.faces.max()}",
         )
-    used = mesh.vertices[np.unique(mesh.faces)]
+    chosen = np.unique(mesh.faces)
+    used = mesh.vertices[chosen]
     if not np.isfinite(used).all():
-        raise refuse(path, "finite vertices", "NaN or infinite ones")
+        row = int(np.flatnonzero(~np.isfinite(used).all(1))[0])
+        raise refuse(path, "finite vertices", f"vertex {chosen[row]} at {used[row].tolist()}")
     if np.abs(used).max() > MAX_COORDINATE:
         raise refuse(path, f"coordinates below {MAX_COORDINATE:g}", f"{np.abs(used).max():.3g}")
     corners = mesh.vertices[mesh.faces]
@@ -191,7 +248,7 @@ def kinds(joints: Iterable[Joint]) -> str:
 
 
 def check_object(path: Path, asset: ArticulatedObject) -> None:
-    """The finished object keeps CONTRACT 1: parts with surfaces, unit axes, travel, centred box.
+    """Refuse an object without surfaces, unit axes, travel or a centred box.
 
     Raises:
         AssetError: It does not; no input should get this far.

@@ -10,7 +10,7 @@ from typing import Any
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
-from sim_assets.models.validate import MAX_URDF_BYTES, Repairs, refuse
+from sim_assets.models.validate import MAX_URDF_BYTES, Repairs, read_file, refuse
 
 Element = Any
 """lxml's, which has no types."""
@@ -20,7 +20,6 @@ _BOMS = (
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
 _DECLARATION = re.compile(r"\A<\?xml\b(.*?)\?>", re.DOTALL)
-_COMMENT = re.compile(r"<!--(.*?)-->", re.DOTALL)
 _PREFIX = re.compile(r"(?:</?|\s)([A-Za-z_][\w.-]*):[A-Za-z_][\w.-]*(?=[\s=/>])")
 
 
@@ -33,7 +32,7 @@ def read_xml(path: Path, repairs: Repairs) -> Element:
     Raises:
         AssetError: No file, too large, no text, a DTD or entities, broken XML, no `<robot>`.
     """
-    text = _text(_bytes(path), path, repairs)
+    text = _text(read_file(path, MAX_URDF_BYTES), path, repairs)
     text = _without_declaration(text, repairs)
     text = _without_comments(text, repairs)
     if re.search(r"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
@@ -61,17 +60,6 @@ def children(element: Element, tag: str) -> list[Element]:
 def _is_xacro(element: Element) -> bool:
     space = etree.QName(element).namespace if isinstance(element.tag, str) else None
     return space is not None and "xacro" in space
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        if path.exists() and not path.is_file():
-            raise refuse(path, "a readable file", "something else")
-        if path.stat().st_size > MAX_URDF_BYTES:
-            raise refuse(path, f"at most {MAX_URDF_BYTES >> 20} MiB", "more")
-        return path.read_bytes()
-    except OSError as error:
-        raise refuse(path, "a readable file", str(error.strerror)) from error
 
 
 def _text(data: bytes, path: Path, repairs: Repairs) -> str:
@@ -105,9 +93,14 @@ def _without_declaration(text: str, repairs: Repairs) -> str:
 
 
 def _without_comments(text: str, repairs: Repairs) -> str:
-    if any("--" in comment or comment.endswith("-") for comment in _COMMENT.findall(text)):
-        repairs.add("Comments with double hyphens were dropped")
-    return _COMMENT.sub("", text)
+    kept, end = [], 0
+    while (start := text.find("<!--", end)) >= 0 and (close := text.find("-->", start + 4)) >= 0:
+        comment = text[start + 4 : close]
+        if "--" in comment or comment.endswith("-"):
+            repairs.add("Comments with double hyphens were dropped")
+        kept.append(text[end:start])
+        end = close + 3
+    return "".join((*kept, text[end:]))
 
 
 def _parse(text: str, path: Path, repairs: Repairs) -> Element:

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
+from scapo.categories import Category
 from scapo.categories import category as find_category
-from scapo.types import Category
 from sim_assets.objects import ArticulatedObject, Origin, Visual
 from sim_assets.procedural.parameters import HeldOut
 from sim_assets.procedural.shapes import mirrored

@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -38,6 +39,17 @@ class Frame:
     """Part index; 255 where there is no object."""
     color: UInt8[np.ndarray, "H W 3"] | None = None
     """Unlit colour of the surface, sRGB."""
+
+
+@lru_cache(maxsize=4)
+def pixel_rays(camera: Intrinsics) -> Float[np.ndarray, "K 3"]:
+    """Rays through the centres of all pixels, row by row, with z = 1; not to be written to."""
+    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    x, y = np.meshgrid(u, v)
+    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
+    rays.setflags(write=False)
+    return rays
 
 
 class AbstractRenderer(ABC):
@@ -79,8 +91,8 @@ class AbstractRenderer(ABC):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ask:
-    """A picture asked for: the arguments of `AbstractRenderer.render`."""
+class RenderRequest:
+    """A picture to render: the arguments of `AbstractRenderer.render`."""
 
     state: Float[np.ndarray, " J"]
     camera_T_object: Float[np.ndarray, "4 4"]
@@ -89,18 +101,18 @@ class Ask:
 
 
 class AbstractParallelRenderer(AbstractRenderer):
-    """Shows several objects at once, each in a place of its own."""
+    """Shows several objects at once, each in a sub-scene of its own."""
 
-    places: int
+    capacity: int
     """How many it shows at once with profit."""
 
     @abstractmethod
     def open_all(self, things: Sequence[ArticulatedObject]) -> None:
-        """Show one object in each place from now on; the same one may be in several."""
+        """Show one object in each sub-scene from now on; the same one may be in several."""
 
     @abstractmethod
-    def render_all(self, asks: Sequence[Ask | None]) -> list[Frame | None]:
-        """A picture for each place that asks for one; all with the same intrinsics.
+    def render_all(self, requests: Sequence[RenderRequest | None]) -> list[Frame | None]:
+        """A picture for each sub-scene that has a request; all with the same intrinsics.
 
         Raises:
             RenderError: The device failed.

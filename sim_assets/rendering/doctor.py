@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What works on this machine: renderers, drivers, packages, and how to get what is missing.
 
-Each renderer is tried in a process of its own (`probe`), since a broken driver can end the process.
+Each renderer is tried in a process of its own (`probe`), since a broken driver can end the process;
+all are tried side by side.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -22,12 +25,13 @@ from rich.table import Table
 from rich.text import Text
 
 PROBE_SECONDS = 120.0
+RENDERERS = ("sapien", "raycast", "maniskill")
 
 PACKAGES: dict[str, tuple[str, ...]] = {
     "core": ("torch", "numpy", "scipy", "roma", "safetensors", "jaxtyping", "rich", "tyro"),
     "sim": ("sapien", "embreex", "trimesh", "yourdfpy", "lxml", "pillow"),
     "gpu-sim": ("mani-skill",),
-    "bench": ("pandas", "jinja2", "small-gicp", "matplotlib", "tensorboard"),
+    "bench": ("pandas", "small-gicp", "matplotlib", "tensorboard"),
     "view": ("viser",),
     "cluster": ("ray",),
 }
@@ -71,16 +75,35 @@ class DoctorReport:
         return next((r.name for r in self.renderers if r.works and r.name != "maniskill"), None)
 
 
-def report() -> DoctorReport:
-    """Look at this machine; takes some seconds, because every renderer draws a picture."""
-    return DoctorReport(
-        system=f"{_system()}, {platform.machine()}, Python {platform.python_version()}",
-        renderers=(probe("sapien"), probe("raycast"), _maniskill()),
-        packages=tuple(
-            (extra, name, _version(name)) for extra, names in PACKAGES.items() for name in names
-        ),
-        drivers=tuple(_drivers()),
-    )
+def report(on_progress: Callable[[str], None] = lambda line: None) -> DoctorReport:
+    """Look at this machine; takes some seconds, because every renderer draws a picture.
+
+    Args:
+        on_progress: Called with a line for each thing that is tried, and with what came of it.
+    """
+    with ThreadPoolExecutor() as threads:
+        drivers = threads.submit(_drivers)
+        tried = {threads.submit(_try, name): name for name in RENDERERS}
+        for name in RENDERERS:
+            on_progress(f"{name}: drawing a picture ...")
+        for ended in as_completed(tried):
+            item = ended.result()
+            on_progress(f"{item.name}: {'works' if item.works else 'does not work'}, {item.detail}")
+        on_progress("drivers and packages ...")
+        return DoctorReport(
+            system=f"{_system()}, {platform.machine()}, Python {platform.python_version()}",
+            renderers=tuple(ended.result() for ended in tried),
+            packages=tuple(
+                (extra, name, _version(name)) for extra, names in PACKAGES.items() for name in names
+            ),
+            drivers=tuple(drivers.result()),
+        )
+
+
+def _try(backend: str) -> Renderer:
+    if backend == "maniskill" and find_spec("mani_skill") is None:
+        return _broken(backend, "not installed (many objects at once, for a CUDA GPU)")
+    return probe(backend)
 
 
 def render(found: DoctorReport) -> Group:
@@ -166,12 +189,6 @@ def _driver_remedy() -> str:
     sudo = "" if os.geteuid() == 0 else "sudo "
     suite = "-t bookworm-backports " if _release().get("VERSION_CODENAME") == "bookworm" else ""
     return f"{sudo}apt-get install {suite}libvulkan1 libx11-6 {MESA_PACKAGE}"
-
-
-def _maniskill() -> Renderer:
-    if find_spec("mani_skill") is None:
-        return _broken("maniskill", "not installed (many objects at once, for a CUDA GPU)")
-    return probe("maniskill")
 
 
 def _version(package: str) -> str | None:

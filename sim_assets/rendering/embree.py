@@ -8,8 +8,6 @@ keeps its own scene and the rays are moved instead (rebuilding 50,000 triangles 
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
@@ -18,7 +16,7 @@ from jaxtyping import Float, Int
 from scapo.geometry.camera import Intrinsics
 from sim_assets.models.textures import Paint
 from sim_assets.objects import ArticulatedObject
-from sim_assets.rendering.base import BACKGROUND, AbstractRenderer, Frame, RenderError
+from sim_assets.rendering.base import BACKGROUND, AbstractRenderer, Frame, RenderError, pixel_rays
 
 REBUILD_BELOW = 12_000
 """Triangles up to which an object is merged and rebuilt for each view."""
@@ -27,8 +25,12 @@ REBUILD_BELOW = 12_000
 class RaycastRenderer(AbstractRenderer):
     """Renders with Embree; see `AbstractRenderer`."""
 
-    def __init__(self, *, color: bool = False) -> None:
-        self.color = color
+    def __init__(self, *, color: bool = False, rebuild_below: int = REBUILD_BELOW) -> None:
+        """Store colours or not; objects of more triangles than `rebuild_below` are never rebuilt.
+
+        For several pictures of one object in a row, 0 is fastest.
+        """
+        self.color, self.rebuild_below = color, rebuild_below
         self.object: ArticulatedObject | None = None
 
     def open(self, thing: ArticulatedObject) -> None:
@@ -38,7 +40,7 @@ class RaycastRenderer(AbstractRenderer):
         self.vertices = [np.asarray(mesh.vertices, np.float64) for mesh in meshes]
         self.faces = [np.asarray(mesh.faces, np.int32) for mesh in meshes]
         self.paints = [Paint(visuals) for visuals in thing.visuals] if self.color else []
-        self.large = sum(len(faces) for faces in self.faces) > REBUILD_BELOW
+        self.large = sum(len(faces) for faces in self.faces) > self.rebuild_below
         self.scenes = [
             _embree(vertices, faces) if self.large else None
             for vertices, faces in zip(self.vertices, self.faces, strict=True)
@@ -150,20 +152,12 @@ def _plane_depth(
     return depth
 
 
-@lru_cache(maxsize=4)
-def _all_rays(camera: Intrinsics) -> Float[np.ndarray, "H W 3"]:
-    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    x, y = np.meshgrid(u, v)
-    return np.stack([x, y, np.ones_like(x)], -1)
-
-
 def _rays(
     camera: Intrinsics, points: Float[np.ndarray, "V 3"]
 ) -> tuple[Int[np.ndarray, " K"], Float[np.ndarray, "K 3"]]:
     """Flat pixel indices and rays of the image rectangle that the points span."""
-    rays = _all_rays(camera)
     height, width = camera.height, camera.width
+    rays = pixel_rays(camera).reshape(height, width, 3)
     left, right, top, bottom = 0, width, 0, height
     if (points[:, 2] > 1e-6).all():
         u = points[:, 0] / points[:, 2] * camera.fx + camera.cx

@@ -3,14 +3,14 @@
 
 No environment and no simulation: a `ManiSkillScene` whose sub-scenes hold a kinematic actor per
 part and one for the camera (one that is fixed has the same pose in all sub-scenes). Actors and not
-articulations, so that parts stand exactly where `scene` puts them: a rounded pose would now and
+articulations, so that parts stand exactly where `sapien` puts them: a rounded pose would now and
 then win or lose a pixel, and so change which points are drawn. The shader is SAPIEN's `trivial`,
 whose positions are metres in float32; ManiSkill's own configurations give whole millimetres.
 
 On a CUDA device PhysX keeps all poses in one buffer there, from which the renderers take them
 (`RenderSystemGroup.set_cuda_poses`); all pictures are taken in one call and reduced to depth and
 part before they are fetched. This way follows ManiSkill 3.0.1's source and has not been run on a
-GPU yet. Elsewhere the sub-scenes are drawn in turn, which is tested against `scene`.
+GPU yet. Elsewhere the sub-scenes are drawn in turn, which is tested against `sapien`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,13 @@ from jaxtyping import Float
 
 from scapo.geometry.camera import Intrinsics
 from sim_assets.objects import ArticulatedObject
-from sim_assets.rendering.base import BACKGROUND, AbstractParallelRenderer, Ask, Frame, RenderError
+from sim_assets.rendering.base import (
+    BACKGROUND,
+    AbstractParallelRenderer,
+    Frame,
+    RenderError,
+    RenderRequest,
+)
 from sim_assets.rendering.sapien import (
     camera_pose,
     depth_range,
@@ -51,7 +57,7 @@ with warnings.catch_warnings():
 
 TEXTURES = {"Position": ["position"], "Segmentation": ["segmentation"], "Color": ["rgb"]}
 """Of the shader `trivial`, as ManiSkill names what they hold."""
-PLACES_CUDA, PLACES_CPU = 64, 4
+CAPACITY_CUDA, CAPACITY_CPU = 64, 4
 NEAR, FAR = 0.05, 100.0
 """Planes on CUDA in units of the object's reach; a camera group's cameras are set up once."""
 AWAY = 1e4
@@ -70,12 +76,12 @@ def versions() -> dict[str, str]:
 class ManiSkillRenderer(AbstractParallelRenderer):
     """Renders with ManiSkill; see `AbstractParallelRenderer`."""
 
-    def __init__(self, *, color: bool = False, places: int | None = None) -> None:
+    def __init__(self, *, color: bool = False, capacity: int | None = None) -> None:
         """Look the device up.
 
         Args:
             color: Whether frames have colours.
-            places: Objects at once; None for a number that suits the device.
+            capacity: Objects at once; None for a number that suits the device.
 
         Raises:
             RenderError: No device renders here.
@@ -83,9 +89,9 @@ class ManiSkillRenderer(AbstractParallelRenderer):
         self.device = find_device()
         self.cuda = bool(self.device.is_cuda())
         self.color = color
-        self.places = places or (PLACES_CUDA if self.cuda else PLACES_CPU)
+        self.capacity = capacity or (CAPACITY_CUDA if self.cuda else CAPACITY_CPU)
         self.things: tuple[ArticulatedObject, ...] = ()
-        self.stage: _Stage | None = None
+        self.sub_scenes: _SubScenes | None = None
 
     def open(self, thing: ArticulatedObject) -> None:
         """See `AbstractRenderer.open`."""
@@ -106,36 +112,42 @@ class ManiSkillRenderer(AbstractParallelRenderer):
         """See `AbstractRenderer.render`."""
         if len(self.things) != 1:
             raise RenderError(f"expected one open object, found {len(self.things)}")
-        ask = Ask(state=state, camera_T_object=camera_T_object, camera=camera, only=only)
-        return next(frame for frame in self.render_all([ask]) if frame is not None)
+        request = RenderRequest(
+            state=state, camera_T_object=camera_T_object, camera=camera, only=only
+        )
+        return next(frame for frame in self.render_all([request]) if frame is not None)
 
-    def render_all(self, asks: Sequence[Ask | None]) -> list[Frame | None]:
+    def render_all(self, requests: Sequence[RenderRequest | None]) -> list[Frame | None]:
         """See `AbstractParallelRenderer.render_all`."""
-        if len(asks) != len(self.things):
-            raise RenderError(f"expected an ask for each of {len(self.things)}, found {len(asks)}")
-        cameras = {ask.camera for ask in asks if ask is not None}
+        if len(requests) != len(self.things):
+            raise RenderError(
+                f"expected a request for each of {len(self.things)}, found {len(requests)}"
+            )
+        cameras = {request.camera for request in requests if request is not None}
         if not cameras:
-            return [None] * len(asks)
+            return [None] * len(requests)
         if len(cameras) > 1:
-            raise RenderError(f"expected the same intrinsics in all places, found {len(cameras)}")
+            raise RenderError(
+                f"expected the same intrinsics in all sub-scenes, found {len(cameras)}"
+            )
         (camera,) = cameras
         try:
-            if self.stage is None or self.stage.intrinsics != camera:
-                self.stage = _Stage(self.device, self.things, camera, self.color)
-            self.stage.place(asks)
-            return self.stage.shoot(asks)
+            if self.sub_scenes is None or self.sub_scenes.intrinsics != camera:
+                self.sub_scenes = _SubScenes(self.device, self.things, camera, self.color)
+            self.sub_scenes.place(requests)
+            return self.sub_scenes.capture(requests)
         except RuntimeError as error:
             raise RenderError(f"ManiSkill: {error}") from error
 
     def close(self) -> None:
         """Drop the scenes with all they hold."""
-        self.things, shown, self.stage = (), self.stage is not None, None
+        self.things, shown, self.sub_scenes = (), self.sub_scenes is not None, None
         if shown:
             gc.collect()  # ManiSkill's scenes and cameras hold each other, and the device's memory
 
 
-class _Stage:
-    """A sub-scene per place: an actor per part and one that carries the camera."""
+class _SubScenes:
+    """A sub-scene per object: an actor per part and one that carries the camera."""
 
     def __init__(
         self,
@@ -158,17 +170,17 @@ class _Stage:
         self.sensor = self._add_cameras()
 
     def _add_parts(self) -> list[Any]:
-        """In order of place and part; shapes of an object in several places are shared."""
+        """In order of sub-scene and part; shapes of an object in several sub-scenes are shared."""
         shapes: dict[int, list[list[Any]]] = {}
         actors = []
-        for place, thing in enumerate(self.things):
+        for number, thing in enumerate(self.things):
             made = shapes.get(id(thing))
             if made is None:
                 made = shapes[id(thing)] = [make_shapes(v, self.color) for v in thing.visuals]
             else:
                 made = [[shape.clone() for shape in part] for part in made]
             for part, surfaces in enumerate(made):
-                actor = _kinematic(self.scene, f"object{place}part{part}", [place], surfaces)
+                actor = _kinematic(self.scene, f"object{number}part{part}", [number], surfaces)
                 found = actor._objs[0].per_scene_id
                 if found != part + 1:
                     raise RenderError(f"expected entity {part + 1}, found {found}")
@@ -192,13 +204,16 @@ class _Stage:
             _set_intrinsics(camera, self.intrinsics, (NEAR * reach, FAR * reach))
         return sensor
 
-    def place(self, asks: Sequence[Ask | None]) -> None:
-        """Put parts and cameras where the asks say; places that ask for nothing stay."""
+    def place(self, requests: Sequence[RenderRequest | None]) -> None:
+        """Put parts and cameras where the requests say; sub-scenes without one stay."""
         parts = []
-        for thing, ask in zip(self.things, asks, strict=True):
+        for thing, request in zip(self.things, requests, strict=True):
             count = len(thing.visuals)
-            parts += [None] * count if ask is None else _part_poses(thing, ask)
-        eyes = [None if ask is None else camera_pose(ask.camera_T_object) for ask in asks]
+            parts += [None] * count if request is None else _part_poses(thing, request)
+        eyes = [
+            None if request is None else camera_pose(request.camera_T_object)
+            for request in requests
+        ]
         for actor, poses in ((self.parts, parts), (self.eyes, eyes)):
             if self.cuda:
                 _move_on_device(actor, poses)
@@ -207,11 +222,11 @@ class _Stage:
                 if pose is not None:
                     entity.set_pose(pose)
 
-    def shoot(self, asks: Sequence[Ask | None]) -> list[Frame | None]:
+    def capture(self, requests: Sequence[RenderRequest | None]) -> list[Frame | None]:
         """The pictures."""
-        return self._shoot_at_once(asks) if self.cuda else self._shoot_in_turn(asks)
+        return self._capture_at_once(requests) if self.cuda else self._capture_in_turn(requests)
 
-    def _shoot_at_once(self, asks: Sequence[Ask | None]) -> list[Frame | None]:
+    def _capture_at_once(self, requests: Sequence[RenderRequest | None]) -> list[Frame | None]:
         """All pictures on the device, fetched as depth, part and colour."""
         self.scene.update_render()
         self.sensor.capture()
@@ -226,19 +241,19 @@ class _Stage:
             color = shade.to(torch.uint8).cpu().numpy()
         return [
             None
-            if ask is None
+            if request is None
             else Frame(depth=depth[i], part=part[i], color=None if color is None else color[i])
-            for i, ask in enumerate(asks)
+            for i, request in enumerate(requests)
         ]
 
-    def _shoot_in_turn(self, asks: Sequence[Ask | None]) -> list[Frame | None]:
+    def _capture_in_turn(self, requests: Sequence[RenderRequest | None]) -> list[Frame | None]:
         frames: list[Frame | None] = []
         cameras = zip(self.scene.sub_scenes, self.sensor.camera._render_cameras, strict=True)
-        for (scene, camera), reach, ask in zip(cameras, self.reach, asks, strict=True):
-            if ask is None:
+        for (scene, camera), reach, request in zip(cameras, self.reach, requests, strict=True):
+            if request is None:
                 frames.append(None)
                 continue
-            _set_intrinsics(camera, ask.camera, depth_range(ask.camera_T_object, reach))
+            _set_intrinsics(camera, request.camera, depth_range(request.camera_T_object, reach))
             scene.update_render()
             camera.take_picture()
             part = camera.get_picture("Segmentation")[..., 1].astype(np.uint8) - np.uint8(1)
@@ -250,14 +265,14 @@ class _Stage:
         return frames
 
 
-def _make_scene(device: Any, places: int) -> Any:  # noqa: ANN401
+def _make_scene(device: Any, count: int) -> Any:  # noqa: ANN401
     """A ManiSkill scene of empty sub-scenes, all at the origin: nothing in them can collide."""
     kind = "cuda" if device.is_cuda() else "cpu"
-    systems: list[Any] = [physx.PhysxCpuSystem() for _ in range(places)] if kind == "cpu" else []
+    systems: list[Any] = [physx.PhysxCpuSystem() for _ in range(count)] if kind == "cpu" else []
     if kind == "cuda":
         if not physx.is_gpu_enabled():
             physx.enable_gpu()
-        systems = [physx.PhysxGpuSystem(device=device)] * places
+        systems = [physx.PhysxGpuSystem(device=device)] * count
     scenes = [sapien.Scene([system, sapien.render.RenderSystem(device)]) for system in systems]
     if kind == "cuda":
         for scene in scenes:
@@ -273,22 +288,22 @@ def _make_scene(device: Any, places: int) -> Any:  # noqa: ANN401
     return ManiSkillScene(scenes, device=where, backend=backend)
 
 
-def _kinematic(scene: Any, name: str, places: list[int], shapes: Sequence[Any] = ()) -> Any:  # noqa: ANN401
-    """An actor that is only moved, in each of some places."""
+def _kinematic(scene: Any, name: str, numbers: list[int], shapes: Sequence[Any] = ()) -> Any:  # noqa: ANN401
+    """An actor that is only moved, in each of some sub-scenes."""
     builder = scene.create_actor_builder()
-    builder.set_scene_idxs(places)
+    builder.set_scene_idxs(numbers)
     builder._procedural_shapes = list(shapes)
-    rest = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]] * len(places), device=scene.device)
+    rest = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0]] * len(numbers), device=scene.device)
     builder.initial_pose = Pose.create(rest, device=scene.device)
     return builder.build_kinematic(name)
 
 
-def _part_poses(thing: ArticulatedObject, ask: Ask) -> list[Any]:
-    poses = [sapien.Pose(object_T_part) for object_T_part in thing.pose(ask.state)]
-    if ask.only is None:
+def _part_poses(thing: ArticulatedObject, request: RenderRequest) -> list[Any]:
+    poses = [sapien.Pose(object_T_part) for object_T_part in thing.pose(request.state)]
+    if request.only is None:
         return poses
     away = sapien.Pose([0, 0, AWAY])
-    return [pose if part == ask.only else away for part, pose in enumerate(poses)]
+    return [pose if part == request.only else away for part, pose in enumerate(poses)]
 
 
 def _move_on_device(actor: Any, poses: Sequence[Any]) -> None:  # noqa: ANN401

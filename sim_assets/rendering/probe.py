@@ -15,8 +15,8 @@ from typing import get_args
 import numpy as np
 import trimesh
 
+from scapo.categories import Category, Window
 from scapo.geometry.camera import Intrinsics
-from scapo.types import Category, Window
 from sim_assets.objects import ArticulatedObject, Origin, Visual
 from sim_assets.rendering.backends import make_renderer
 from sim_assets.rendering.base import Backend

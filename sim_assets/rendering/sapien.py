@@ -84,7 +84,7 @@ class SapienRenderer(AbstractRenderer):
         """
         self.device = find_device()
         self.color = color
-        self.stage: _Stage | None = None
+        self.scene: _Scene | None = None
 
     def open(self, thing: ArticulatedObject) -> None:
         """A new scene for each object: one whose objects are exchanged grows in memory.
@@ -92,7 +92,7 @@ class SapienRenderer(AbstractRenderer):
         The old scene goes only when the new one is there, since SAPIEN makes what scenes share
         anew, in 20 ms, when there was none left.
         """
-        self.stage = _Stage(self.device, thing, self.color)
+        self.scene = _Scene(self.device, thing, self.color)
 
     def render(
         self,
@@ -102,19 +102,19 @@ class SapienRenderer(AbstractRenderer):
         only: int | None = None,
     ) -> Frame:
         """See `AbstractRenderer.render`."""
-        if self.stage is None:
+        if self.scene is None:
             raise RenderError("expected an open object, found none")
-        self.stage.pose(state)
-        self.stage.show(only)
-        self.stage.aim(camera_T_object, camera)
-        return self.stage.shoot()
+        self.scene.pose(state)
+        self.scene.show(only)
+        self.scene.aim(camera_T_object, camera)
+        return self.scene.capture()
 
     def close(self) -> None:
         """Drop the scene with all it holds."""
-        self.stage = None
+        self.scene = None
 
 
-class _Stage:
+class _Scene:
     """A scene with one object: an entity per part, and a camera."""
 
     def __init__(self, device: sapien.Device, thing: ArticulatedObject, color: bool) -> None:
@@ -154,7 +154,7 @@ class _Stage:
             near, far, camera.fx, camera.fy, camera.cx, camera.cy, 0.0
         )
 
-    def shoot(self) -> Frame:
+    def capture(self) -> Frame:
         self.scene.update_render()
         self.camera.take_picture()
         if not self.color:

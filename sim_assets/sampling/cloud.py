@@ -8,7 +8,6 @@ its part's pose lies on that part's surface to a few micrometres.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -18,7 +17,7 @@ from scapo.geometry.camera import Intrinsics
 from sim_assets.models.textures import Paint
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import Sampling
-from sim_assets.rendering.base import Frame
+from sim_assets.rendering.base import Frame, pixel_rays
 from sim_assets.sampling.viewpoints import generator
 
 SURFACE_SAMPLES = 512
@@ -145,17 +144,6 @@ def _pick(
     return np.stack(images)[source, pixel]
 
 
-@lru_cache(maxsize=4)
-def pixel_rays(camera: Intrinsics) -> Float[np.ndarray, "K 3"]:
-    """Rays through the centres of all pixels, row by row, with z = 1; not to be written to."""
-    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    x, y = np.meshgrid(u, v)
-    rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-    rays.setflags(write=False)
-    return rays
-
-
 def _back_project(
     frames: list[Frame],
     source: Int[np.ndarray, " N"],
@@ -166,7 +154,7 @@ def _back_project(
     return pixel_rays(camera)[pixel] * z[:, None]
 
 
-class Surface:
+class SurfaceSamples:
     """Points drawn uniformly by area from each part's surface, for `visible` and `full` clouds."""
 
     def __init__(self, thing: ArticulatedObject, *, color: bool = False) -> None:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Where states, cameras and pictures come from: our benchmark's rules and the published ones.
+"""The presets of `--preset`: camera, joint states and views of our benchmark and of published data.
 
-`sim-art` and `sim-art-sensor` are the two parts of the benchmark (CONTRACT 4). `op-align` and `eap`
-have the articulation windows and view grids of the published data generators (PROTOCOL 2.4, 2.5).
-What those leave open is decided here and said at the place.
+`sim-art` and those named after it are the parts of the benchmark (docs/benchmark.md).
+`op-align` and `eap` have the articulation windows and view grids of the published data generators
+(docs/protocol.md). What those leave open is decided here and said at the place.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from jaxtyping import Float
 
 from scapo.geometry.camera import Intrinsics
-from sim_assets.options import Preset, Protocol, Sampling
+from sim_assets.options import PresetName, Protocol, Sampling
 
 Order = Literal["yxz", "zyx"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Thetas:
+class AngleSequence:
     """Published joint angles of samples k = 0 .. 99, start + step * k, as states of ours."""
 
     start: float
@@ -38,7 +38,7 @@ class Thetas:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ThetaGrid:
+class AngleGrid:
     """Published angles of two joints on a grid: step * floor(k / 10) and step * (k mod 10)."""
 
     train: float
@@ -63,11 +63,11 @@ class ViewGrid:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Published:
-    """The rules of a published generator."""
+    """Joint states and views of a published data generator."""
 
-    full: dict[str, Thetas | ThetaGrid]
+    full: dict[str, AngleSequence | AngleGrid]
     """Of complete clouds, by category; joints of other categories move as in `sim-art`."""
-    partial: dict[str, Thetas | ThetaGrid]
+    partial: dict[str, AngleSequence | AngleGrid]
     """Of partial clouds."""
     views: dict[str, ViewGrid]
     """Of partial clouds, by category."""
@@ -80,45 +80,48 @@ class Published:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Rules:
-    """One preset."""
+class Preset:
+    """Camera, protocol, and where joint states and views come from."""
 
     camera: Intrinsics
     protocol: Protocol = "joint"
     sampling: Sampling = "random"
     distance: bool = False
     """The camera's distance is drawn, not the object's size in the image."""
+    paired: bool = False
+    """Whole surfaces in the states and places of the views that `sim-art` keeps: each sample is
+    that of `sim-art` with the same number, turned by a rotation uniform over all."""
     published: Published | None = None
     """None: states and views of the category (`scapo.categories`)."""
 
 
 NEAR, FAR = (0.5, 0.9), (1.0, 1.6)
 """Distance from the camera to the object's origin in `sim-art-sensor`, m: of objects whose bounding
-box at rest has a diagonal of up to LARGE, and of larger ones (CONTRACT 4)."""
+box at rest has a diagonal of up to LARGE, and of larger ones (docs/benchmark.md)."""
 LARGE = 0.6
 PUBLISHED_DISTANCE = 1.8
 """From the camera to the object's origin in diagonals of the object at rest, to which the published
-generators scale it (PROTOCOL 2.4, 2.5)."""
+generators scale it (docs/protocol.md)."""
 
-_EYEGLASSES = ThetaGrid(train=18 * 0.45, test=18 * 0.35)
+_EYEGLASSES = AngleGrid(train=18 * 0.45, test=18 * 0.35)
 _WIDE = ViewGrid(order="yxz", start=-90.0, step=1.8)
 _NARROW = ViewGrid(order="zyx", start=-22.5, step=0.45)
 _LAPTOP_ZERO, _SAFE_ZERO = 90.0, 45.0
 
 OP_ALIGN = Published(
     full={
-        "laptop": Thetas(start=-45, step=0.9, zero=_LAPTOP_ZERO),
-        "safe": Thetas(start=-45, step=0.9, zero=_SAFE_ZERO),
+        "laptop": AngleSequence(start=-45, step=0.9, zero=_LAPTOP_ZERO),
+        "safe": AngleSequence(start=-45, step=0.9, zero=_SAFE_ZERO),
         "eyeglasses": _EYEGLASSES,
-        "oven": Thetas(start=45, step=0.8),
-        "washer": Thetas(start=45, step=0.9),
+        "oven": AngleSequence(start=45, step=0.8),
+        "washer": AngleSequence(start=45, step=0.9),
     },
     partial={
-        "laptop": Thetas(start=-45, step=0.75, zero=_LAPTOP_ZERO),
-        "safe": Thetas(start=-45, step=0.75, zero=_SAFE_ZERO),
+        "laptop": AngleSequence(start=-45, step=0.75, zero=_LAPTOP_ZERO),
+        "safe": AngleSequence(start=-45, step=0.75, zero=_SAFE_ZERO),
         "eyeglasses": _EYEGLASSES,
-        "oven": Thetas(start=45, step=0.7),
-        "washer": Thetas(start=60, step=0.6),
+        "oven": AngleSequence(start=45, step=0.7),
+        "washer": AngleSequence(start=60, step=0.6),
     },
     views={"laptop": _NARROW, "safe": _NARROW},
     other_views=_WIDE,
@@ -128,8 +131,8 @@ OP_ALIGN = Published(
 """Laptop and safe from HOI4D, the others from Shape2Motion."""
 
 EAP = Published(
-    full={**OP_ALIGN.full, "laptop": Thetas(start=9, step=-0.9, zero=_LAPTOP_ZERO)},
-    partial={**OP_ALIGN.partial, "laptop": Thetas(start=9, step=-0.9, zero=_LAPTOP_ZERO)},
+    full={**OP_ALIGN.full, "laptop": AngleSequence(start=9, step=-0.9, zero=_LAPTOP_ZERO)},
+    partial={**OP_ALIGN.partial, "laptop": AngleSequence(start=9, step=-0.9, zero=_LAPTOP_ZERO)},
     views={},
     other_views=_NARROW,
     full_views=None,
@@ -139,32 +142,35 @@ EAP = Published(
 category, were never published: the narrow one of the HOI4D models stands for them."""
 
 _PUBLISHED_CAMERA = Intrinsics.from_fov(radians(60), 640, 480)
-PRESETS: dict[Preset, Rules] = {
-    "sim-art": Rules(camera=Intrinsics.from_fov(radians(60), 256, 256)),
-    "sim-art-sensor": Rules(
+PRESETS: dict[PresetName, Preset] = {
+    "sim-art": Preset(camera=Intrinsics.from_fov(radians(60), 256, 256)),
+    "sim-art-sensor": Preset(
         camera=Intrinsics(fx=600, fy=600, cx=320, cy=240, width=640, height=480), distance=True
     ),
-    "op-align": Rules(
+    "sim-art-complete": Preset(
+        camera=Intrinsics.from_fov(radians(60), 256, 256), protocol="full", paired=True
+    ),
+    "op-align": Preset(
         camera=_PUBLISHED_CAMERA, protocol="isolated", sampling="fps", published=OP_ALIGN
     ),
-    "eap": Rules(camera=_PUBLISHED_CAMERA, protocol="isolated", sampling="fps", published=EAP),
+    "eap": Preset(camera=_PUBLISHED_CAMERA, protocol="isolated", sampling="fps", published=EAP),
 }
 
 
-def rules(name: str) -> Rules:
+def find_preset(name: str) -> Preset:
     """The preset of this name.
 
     Raises:
         ValueError: There is none.
     """
-    if name not in get_args(Preset):
+    if name not in get_args(PresetName):
         raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, found {name!r}")
     return next(value for key, value in PRESETS.items() if key == name)
 
 
 def camera(name: str, image_size: int | None) -> Intrinsics:
     """The preset's camera, or one of its vertical field of view with a square image."""
-    made = rules(name).camera
+    made = find_preset(name).camera
     if image_size is None:
         return made
     return Intrinsics.from_fov(2 * np.arctan(made.height / 2 / made.fy), image_size, image_size)
@@ -176,7 +182,7 @@ def least_points(name: str, protocol: Protocol, parts: int, points: int) -> tupl
     OP-Align draws a sample again that has 50 points or fewer of label 1, or 150 or fewer of label
     0. Zero for parts without a rule.
     """
-    published = rules(name).published
+    published = find_preset(name).published
     if published is None or protocol == "full":
         return (0,) * parts
     asked = [*published.least, *[0] * parts][:parts]
@@ -185,10 +191,10 @@ def least_points(name: str, protocol: Protocol, parts: int, points: int) -> tupl
 
 @cache
 def windows(
-    name: Preset, category: str, protocol: Protocol
-) -> tuple[Thetas | ThetaGrid | None, ViewGrid | None]:
+    name: PresetName, category: str, protocol: Protocol
+) -> tuple[AngleSequence | AngleGrid | None, ViewGrid | None]:
     """Articulation window (None: the category's travel) and view grid (None: all rotations)."""
-    published = rules(name).published
+    published = find_preset(name).published
     if published is None:
         raise ValueError(f"preset: expected a published one, found {name!r}")
     if protocol == "full":

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""Joint states and cameras: uniform in the category's travel and viewing window (CONTRACT 4).
+"""Joint states and cameras of views, by the rules of a preset.
 
-The camera stands in the window, seen from the origin of the object frame; its distance is solved so
-that the box around the object's image fills the drawn share of the image, and its gaze is turned so
-that this box lies at the drawn place. Roll is uniform, since poses are arbitrary in SE(3).
+`sim-art`: states are uniform in the category's travel. The camera stands in its viewing window,
+seen from the origin of the object frame; its distance is solved so that the box around the object's
+image fills the drawn share of the image, and its gaze is turned so that this box lies at the drawn
+place. Roll is uniform, since poses are arbitrary in SE(3). `sim-art-sensor`: the same at a drawn
+distance.
 
-States and cameras of a preset: the category's window, drawn distances, or published grids.
-
-The published pictures (PROTOCOL 2.5) look along -z at the object 1.8 ahead of it, turned -90
+`op-align` and `eap`: the published pictures look along -z at the object 1.8 ahead of it, turned -90
 degrees about y and then by the view's rotation. The models' own frame is not described; that the
-halves of their laptops are exchanged by (x, y, z) -> (z, -y, x) (PROTOCOL 1.2) puts the hinge
-along y and one half upright along z. Here their z is up and their front faces +x, towards the
-camera.
+halves of their laptops are exchanged by (x, y, z) -> (z, -y, x) puts the hinge along y and one half
+upright along z. Here their z is up and their front faces +x, towards the camera.
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from scapo.categories import Window
 from scapo.geometry.camera import Intrinsics
-from scapo.types import Window
 from sim_assets.objects import ArticulatedObject
-from sim_assets.options import Preset, Protocol
+from sim_assets.options import PresetName, Protocol
 from sim_assets.sampling import presets
-from sim_assets.sampling.presets import ThetaGrid, Thetas, ViewGrid
+from sim_assets.sampling.presets import AngleGrid, AngleSequence, ViewGrid
 
 TRAVEL = (0.15, 0.95)
 """States are drawn from this share of the travel."""
@@ -39,12 +38,19 @@ FILL = (0.5, 0.9)
 """The longer side of the object's image, as a share of the image's side."""
 FILL_MARGIN = 0.006
 """Kept from both ends of FILL: whole pixels, STEPS and OUTLINE_DIRECTIONS cost less."""
+FULL_FRAME = 0.95
+"""Largest share of the picture's side that the object's image fills."""
 JITTER = 0.05
 """Largest offset of the box's centre from the image's centre, as a share of the image's side."""
 OUTLINE_DIRECTIONS = 400
 """In which the outermost points of each part are kept."""
 STEPS = 6
 """Of the fixed-point iteration that frames the object; 1e-3 of the image is left at most."""
+PUBLISHED_T_OBJECT = np.diag([-1.0, -1.0, 1.0])
+"""From our object frame (front -x) to the one taken for theirs (front +x)."""
+OPENCV_T_OPENGL = np.diag([1.0, -1.0, -1.0])
+TURN_AWAY = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+"""-90 degrees about y."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,6 +60,18 @@ class View:
     states: Float[np.ndarray, "K J"]
     """rad or m."""
     camera_T_object: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewOptions:
+    """What the states and cameras of views depend on, besides the object."""
+
+    preset: PresetName
+    protocol: Protocol
+    camera: Intrinsics
+    states_per_view: int
+    held_out: bool
+    """A test split: eyeglasses then have a published grid of their own."""
 
 
 def generator(*key: object) -> np.random.Generator:
@@ -108,6 +126,24 @@ def outermost(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "_ 3"]:
     return points[np.unique((points @ directions).argmax(0))]
 
 
+def draw_preset_views(
+    outline: Outline, rngs: Sequence[np.random.Generator], options: ViewOptions
+) -> list[View]:
+    """For each generator, states and a camera by the preset's rules.
+
+    Args:
+        outline: Of the object.
+        rngs: One per view; a view is a function of its own alone.
+        options: Preset, protocol, camera and number of states.
+    """
+    preset = presets.find_preset(options.preset)
+    if preset.published is not None:
+        return [_published(outline.thing, rng, options) for rng in rngs]
+    if preset.distance:
+        return _at_distance(outline, rngs, options)
+    return draw_views(outline, rngs, options.camera, options.states_per_view)
+
+
 def draw_views(
     outline: Outline, rngs: Sequence[np.random.Generator], camera: Intrinsics, states: int = 1
 ) -> list[View]:
@@ -127,6 +163,38 @@ def draw_views(
     points = np.stack([outline.posed(state) for state in drawn])
     poses = frame_objects(points, np.stack(turns), camera, np.array(fills), np.stack(centres))
     return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
+
+
+def _at_distance(
+    outline: Outline, rngs: Sequence[np.random.Generator], options: ViewOptions
+) -> list[View]:
+    """The category's window, at drawn distances from which the whole object is in the picture.
+
+    Where even the largest distance is too near for that, the camera stands there.
+    """
+    thing = outline.thing
+    drawn, turns, centres, places = [], [], [], []
+    for rng in rngs:
+        size = (options.states_per_view, len(thing.upper))
+        drawn.append(rng.uniform(*TRAVEL, size=size) * thing.upper)
+        gaze = -draw_direction(thing.category.window, rng)
+        turns.append(look_along(gaze, rng.uniform(-np.pi, np.pi)))
+        centres.append(rng.uniform(-1, 1, size=2) * min(JITTER, (1 - FULL_FRAME) / 2))
+        places.append(rng.uniform())
+    points = np.stack([outline.posed(states) for states in drawn])
+    fill = np.full(len(points), FULL_FRAME)
+    poses = frame_objects(points, np.stack(turns), options.camera, fill, np.stack(centres))
+    nearest = np.sqrt((poses[:, :3, 3] ** 2).sum(-1))
+    low, high = distances(thing)
+    low = np.clip(nearest, low, high)
+    poses[:, :3, 3] *= ((low + np.array(places) * (high - low)) / nearest)[:, None]
+    return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
+
+
+def distances(thing: ArticulatedObject) -> tuple[float, float]:
+    """Least and largest distance of the camera from the object's origin in `sim-art-sensor`, m."""
+    large = float(np.linalg.norm(thing.extents())) > presets.LARGE
+    return presets.FAR if large else presets.NEAR
 
 
 def draw_direction(window: Window, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
@@ -250,85 +318,14 @@ def _turn(
     return np.eye(3) + skew + _compose(skew, skew) * factor[:, None, None]
 
 
-PUBLISHED_T_OBJECT = np.diag([-1.0, -1.0, 1.0])
-"""From our object frame (front -x) to the one taken for theirs (front +x)."""
-OPENCV_T_OPENGL = np.diag([1.0, -1.0, -1.0])
-TURN_AWAY = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-"""-90 degrees about y."""
-FULL_FRAME = 0.95
-"""Largest share of the picture's side that the object's image fills."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Wanted:
-    """What views depend on."""
-
-    preset: Preset
-    protocol: Protocol
-    camera: Intrinsics
-    states_per_view: int
-    held_out: bool
-    """A test split: eyeglasses then have a published grid of their own."""
-
-
-def draw_preset_views(
-    outline: Outline, rngs: Sequence[np.random.Generator], wanted: Wanted
-) -> list[View]:
-    """For each generator, states and a camera by the preset's rules.
-
-    Args:
-        outline: Of the object.
-        rngs: One per view; a view is a function of its own alone.
-        wanted: Preset, protocol, camera and number of states.
-    """
-    rules = presets.rules(wanted.preset)
-    if rules.published is not None:
-        return [_published(outline.thing, rng, wanted) for rng in rngs]
-    if rules.distance:
-        return _at_distance(outline, rngs, wanted)
-    return draw_views(outline, rngs, wanted.camera, wanted.states_per_view)
-
-
-def _at_distance(
-    outline: Outline, rngs: Sequence[np.random.Generator], wanted: Wanted
-) -> list[View]:
-    """The category's window, at drawn distances from which the whole object is in the picture.
-
-    Where even the largest distance is too near for that, the camera stands there.
-    """
-    thing = outline.thing
-    drawn, turns, centres, places = [], [], [], []
-    for rng in rngs:
-        size = (wanted.states_per_view, len(thing.upper))
-        drawn.append(rng.uniform(*TRAVEL, size=size) * thing.upper)
-        gaze = -draw_direction(thing.category.window, rng)
-        turns.append(look_along(gaze, rng.uniform(-np.pi, np.pi)))
-        centres.append(rng.uniform(-1, 1, size=2) * min(JITTER, (1 - FULL_FRAME) / 2))
-        places.append(rng.uniform())
-    points = np.stack([outline.posed(states) for states in drawn])
-    fill = np.full(len(points), FULL_FRAME)
-    poses = frame_objects(points, np.stack(turns), wanted.camera, fill, np.stack(centres))
-    nearest = np.sqrt((poses[:, :3, 3] ** 2).sum(-1))
-    low, high = distances(thing)
-    low = np.clip(nearest, low, high)
-    poses[:, :3, 3] *= ((low + np.array(places) * (high - low)) / nearest)[:, None]
-    return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
-
-
-def distances(thing: ArticulatedObject) -> tuple[float, float]:
-    """Least and largest distance of the camera from the object's origin in `sim-art-sensor`, m."""
-    large = float(np.linalg.norm(thing.extents())) > presets.LARGE
-    return presets.FAR if large else presets.NEAR
-
-
-def _published(thing: ArticulatedObject, rng: np.random.Generator, wanted: Wanted) -> View:
+def _published(thing: ArticulatedObject, rng: np.random.Generator, options: ViewOptions) -> View:
     """A sample number for each state and a view of the published grids."""
-    thetas, grid = presets.windows(wanted.preset, thing.category.name, wanted.protocol)
+    thetas, grid = presets.windows(options.preset, thing.category.name, options.protocol)
     states = np.stack(
-        [draw_state(thing, thetas, rng, wanted.held_out) for _ in range(wanted.states_per_view)]
+        [draw_state(thing, thetas, rng, options.held_out) for _ in range(options.states_per_view)]
     )
     turn = rotation(grid, rng)
-    if wanted.protocol != "full":
+    if options.protocol != "full":
         turn = turn @ TURN_AWAY
     pose = np.eye(4)
     pose[:3, :3] = OPENCV_T_OPENGL @ turn @ PUBLISHED_T_OBJECT
@@ -338,7 +335,7 @@ def _published(thing: ArticulatedObject, rng: np.random.Generator, wanted: Wante
 
 def draw_state(
     thing: ArticulatedObject,
-    thetas: Thetas | ThetaGrid | None,
+    thetas: AngleSequence | AngleGrid | None,
     rng: np.random.Generator,
     held_out: bool,
 ) -> Float[np.ndarray, " J"]:
@@ -350,7 +347,7 @@ def draw_state(
     k = rng.uniform()
     if thetas is None:
         return rng.uniform(*TRAVEL, size=len(thing.upper)) * thing.upper
-    if isinstance(thetas, ThetaGrid):
+    if isinstance(thetas, AngleGrid):
         number = int(k * 100)
         step = thetas.test if held_out else thetas.train
         degrees = step * np.array([number // 10, number % 10])[: len(thing.upper)]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """A rendered picture as a depth sensor and a segmentation would give it.
 
-Depth models: `noise_kinect`, `noise_disparity`. Around them what every sensor does: a scene behind
-and beside the object (`noise_scene`), flying pixels and holes (`noise_edges`), a mask with errors
-(`noise_mask`). Poses and joints stay exact, and the part of a pixel is that whose surface the
-sensor measured there, 255 where it is none.
+Depth models: `kinect`, `disparity`. Around them what every sensor does: a scene behind and beside
+the object (`clutter`), flying pixels and holes (`surface`), a mask with errors (`mask`). Poses and
+joints stay exact, and the part of a pixel is that whose surface the sensor measured there, 255
+where it is none.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sim_assets.sensors.kinect import Kinect, kinect_at
 from sim_assets.sensors.mask import CHOSEN as MASK
 from sim_assets.sensors.mask import MaskErrors, wrong_mask
 from sim_assets.sensors.surface import CHOSEN as EDGES
-from sim_assets.sensors.surface import Edges, flying_pixels, holes, surface
+from sim_assets.sensors.surface import EdgeEffects, flying_pixels, holes, surface
 
 Depth = Float[np.ndarray, "H W"]
 Parts = UInt8[np.ndarray, "H W"]
@@ -40,13 +40,13 @@ FOREIGN_COLOR = 128
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
-    """What is simulated."""
+    """What a depth sensor and its mask do to a picture."""
 
     noise: Noise
     mask: Mask
     kinect: Kinect = KINECT
     disparity: Disparity = DISPARITY
-    edges: Edges = EDGES
+    edges: EdgeEffects = EDGES
     clutter: Clutter = BESIDE
     errors: MaskErrors = MASK
 

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: MIT
-"""Slope, incidence angle and depth edges of the surface that a depth image shows.
+"""What a depth image shows of a surface: slope, incidence angle, depth edges; and what edges do.
 
 All in inverse depth q = 1/z, which is linear in the pixel coordinates on a plane: slopes and angles
 of flat surfaces are exact, and a plane has no edges, however steep it is. Everything is computed at
 a list of pixels (`at`, flat indices), as a cloud needs only some of them.
 
-Flying pixels and holes: what depth sensors do at depth edges and at grazing angles.
-
-The published depth models (`noise_kinect`, `noise_disparity`) say nothing of these; the shares
-here are choices that look like real depth images, and are named as such.
+`flying_pixels` and `holes` are what depth sensors do at edges and at grazing angles. The published
+depth models (`kinect`, `disparity`) say nothing of these: the shares here are choices that look
+like real depth images, and are named as such.
 """
 
 from __future__ import annotations
@@ -122,8 +121,8 @@ def incidence(shown: Surface, camera: Intrinsics) -> Float[np.ndarray, " K"]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Edges:
-    """How often what happens."""
+class EdgeEffects:
+    """How often a pixel at an edge or at a grazing angle is wrong or missing."""
 
     flying: float = 0.15
     """Share of the pixels beside a depth edge that measure something between both surfaces."""
@@ -133,14 +132,14 @@ class Edges:
     """Degrees of incidence from which on pixels are lost, and from which on all are."""
 
 
-CHOSEN = Edges()
+CHOSEN = EdgeEffects()
 
 
 def flying_pixels(
     depth: Float[np.ndarray, " K"],
     shown: Surface,
     rng: np.random.Generator,
-    model: Edges = CHOSEN,
+    model: EdgeEffects = CHOSEN,
 ) -> Float[np.ndarray, " K"]:
     """Move some pixels beside depth edges to a place between the two surfaces.
 
@@ -164,7 +163,7 @@ def holes(
     shown: Surface,
     camera: Intrinsics,
     rng: np.random.Generator,
-    model: Edges = CHOSEN,
+    model: EdgeEffects = CHOSEN,
 ) -> Bool[np.ndarray, " K"]:
     """Pixels that measure nothing, beside depth edges and on surfaces seen at a grazing angle.
 

@@ -32,6 +32,7 @@ FLAGS = (
     "--remote-debugging-port=0",
     "--window-size=1280,800",
 )
+LOADED = "document.readyState == 'complete' && location.href != 'about:blank'"
 WAIT = 60.0
 """Seconds for the browser to start and a page to be there."""
 
@@ -53,10 +54,16 @@ class Page:
                 assert "result" in message, message
                 return message["result"]
 
+    def evaluate(self, expression: str) -> Any:
+        """The value of an expression of JavaScript, a promise's once it is there."""
+        result = self.call(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
+        return result["result"].get("value")
+
     def text(self) -> str:
         """What can be read on it."""
-        result = self.call("Runtime.evaluate", expression="document.body.innerText")
-        return str(result["result"].get("value", ""))
+        return str(self.evaluate("document.body.innerText") or "")
 
     def picture(self, file: Path | None = None) -> np.ndarray:
         """A screenshot, (H, W, 3) uint8; kept in a file where one is named."""
@@ -67,20 +74,23 @@ class Page:
 
 
 @contextmanager
-def open_page(url: str, folder: Path) -> Iterator[Page]:
+def open_page(url: str, folder: Path, *flags: str) -> Iterator[Page]:
     """Chromium showing a page; skips the test where there is none. `folder` is its profile."""
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     if program is None:
         pytest.skip("no chromium on this machine")
     connect = pytest.importorskip("websockets.sync.client").connect
     process = subprocess.Popen(
-        [program, *FLAGS, f"--user-data-dir={folder}", url],
+        [program, *FLAGS, *flags, f"--user-data-dir={folder}", url],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
     try:
         with connect(_address(folder, process), max_size=None) as socket:
-            yield Page(socket)
+            page, until = Page(socket), time.monotonic() + WAIT
+            while not page.evaluate(LOADED) and time.monotonic() < until:
+                time.sleep(0.1)
+            yield page
     finally:
         process.terminate()
         process.wait(timeout=30)

@@ -201,6 +201,9 @@ DAMAGE = {
     "an empty canonical shape": added(
         canonical_points=lambda a: np.zeros((len(a["part"]), 0, 3), np.float32)
     ),
+    "a canonical shape of too many points": added(
+        canonical_points=lambda a: np.zeros((len(a["part"]), 1 << 17, 3), np.float32)
+    ),
     "a flat canonical shape": added(
         canonical_points=lambda a: np.zeros((len(a["part"]), 30), np.float32)
     ),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import KDTree
 
 from sim_assets.objects import ArticulatedObject
 from tests.helpers import boxes
@@ -216,3 +217,21 @@ class Calls:
 
     def __reduce__(self) -> Any:
         return self.call
+
+
+def assert_same(found: ArticulatedObject, obj: ArticulatedObject) -> None:
+    """The same parts, joints and poses up to a scale about the box's centre."""
+    scale = np.linalg.norm(found.extents()) / np.linalg.norm(obj.extents())
+    np.testing.assert_allclose(found.axis, obj.axis, atol=1e-5)
+    middle = found.pivot - scale * obj.pivot
+    along = np.einsum("ij,ij->i", middle, obj.axis)
+    np.testing.assert_allclose(middle - along[:, None] * obj.axis, 0, atol=1e-5)
+    state = 0.7 * np.minimum(found.upper, obj.upper)
+    for part, (pose, wanted) in enumerate(zip(found.pose(state), obj.pose(state), strict=True)):
+        mine, theirs = (thing.part_mesh(part) for thing in (found, obj))
+        moved = mine.vertices @ pose[:3, :3].T + pose[:3, 3]
+        meant = scale * (theirs.vertices @ wanted[:3, :3].T + wanted[:3, 3])
+        assert KDTree(meant).query(moved)[0].max() < 1e-5
+        assert KDTree(moved).query(meant)[0].max() < 1e-5
+        # A face may come with its reverse, so that both sides are seen.
+        assert 0.999 < mine.area / (scale**2 * theirs.area) < 2.001

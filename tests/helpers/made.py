@@ -32,7 +32,7 @@ def rotations(generator: np.random.Generator, count: int) -> np.ndarray:
 def sample_arrays(
     name: str, count: int, points: int, *, instances: int = 3, seed: int = 0, background: int = 0
 ) -> Arrays:
-    """The tensors of CONTRACT 3 for `count` samples; the last `background` points are foreign."""
+    """The tensors of a shard for `count` samples; the last `background` points are foreign."""
     made = categories.category(name)
     generator = np.random.default_rng(seed)
     parts = len(made.parts)

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 
-from bench.scoring.score_files import Run, side_file, write_report, write_rows, writing
+from bench.requests import Settings
+from bench.scoring.score_files import Run, writing
 
 SAMPLES, OBJECTS = 40, 8
 
@@ -32,11 +35,24 @@ def make_scores(
     run = Run(method=method, variant=variant, seed=seed, data=f"{kind}@{digest}",
               category=category, split="test")  # fmt: skip
     path = folder / f"{kind}-{category}-{method}-{variant}-{seed}.csv.gz"
-    with writing(path) as stream:
-        write_rows(stream, run, 0, {key: value[:15] for key, value in errors.items()})
-        write_rows(stream, run, 15, {key: value[15:] for key, value in errors.items()})
-    write_report(side_file(path), {
-        "supervision": list(supervision), "instance": (np.arange(samples) % OBJECTS).tolist(),
-        "budget": {"device": "cpu", "seconds": 12.5},
-    })  # fmt: skip
+    with writing(path) as file:
+        file.add(run, 0, {key: value[:15] for key, value in errors.items()})
+        file.add(run, 15, {key: value[15:] for key, value in errors.items()})
+        file.report = report_of(run, supervision, samples)
     return errors
+
+
+def report_of(run, supervision=(), samples=SAMPLES):
+    """A whole report, as `evaluate` writes it."""
+    return {
+        **asdict(run),
+        "supervision": list(supervision), "instance": (np.arange(samples) % OBJECTS).tolist(),
+        "budget": {"device": "cpu", "seconds": 12.5}, "parts": ["a", "b"], "joints": ["revolute"],
+        "settings": asdict(Settings()), "calibration": None, "part_order": None,
+        "counts": {"samples": samples, "instances": OBJECTS, "unanswered": {}},
+        "seeds": {"training": run.seed, "calibration": None, "bootstrap": 0},
+        "digests": {"data": "0" * 64, "predictions": "1" * 64}, "run": {}, "commit": "0abc",
+        "machine": {"cpu": "a chip", "cores": 2}, "versions": {"numpy": "2"}, "summary": {},
+        "average_precision": {"rule": "mean"},
+        "bootstrap": {"resamples": 2000, "seed": 0, "unit": "instance"},
+    }  # fmt: skip

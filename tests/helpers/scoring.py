@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from bench.scoring.evaluate import Request, evaluate
+from bench.requests import Request, Settings
+from bench.scoring.evaluate import evaluate
 from bench.scoring.predictions import write_predictions
 from bench.scoring.score_files import read_scores
-from bench.scoring.scores import Settings
 from scapo.store import open_split
 from tests.helpers import made
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from scapo.geometry.rigid import random_rotations
+from scapo.records import cat
 from scapo.registered.template import ArticulatedTemplate, Placement
-from scapo.registered.views import Views, observe
+from scapo.registered.views import PartialViews, observe
 from tests.helpers.strategies import generator
 
 AXIS = torch.tensor([0.0, 1.0, 0.0])
@@ -54,7 +55,7 @@ def template(seed: int = 0, count: int = 400) -> ArticulatedTemplate:
     return made
 
 
-def sighted(count: int, seed: int = 0, lean: float = 0.0) -> tuple[Views, Placement]:
+def sighted(count: int, seed: int = 0, deviation: float = 0.0) -> tuple[PartialViews, Placement]:
     """Views of the object from about one side, at states 0 to 1, with their true placements.
 
     Only back faces are left out, as a convex object's view would.
@@ -62,8 +63,8 @@ def sighted(count: int, seed: int = 0, lean: float = 0.0) -> tuple[Views, Placem
     Args:
         count: Of views.
         seed: Of all that is drawn.
-        lean: Every other view's hinge leans by this angle (rad) to one side, the others' to the
-            other; the flap rests flat at state 0.
+        deviation: Every other view's axis deviates by this angle (rad) to one side, the others' to
+            the other; the flap rests flat at state 0.
     """
     g = generator(seed)
     rotation = random_rotations(count, g)
@@ -75,7 +76,7 @@ def sighted(count: int, seed: int = 0, lean: float = 0.0) -> tuple[Views, Placem
     for b in range(count):
         whole = template(seed + b + 1, 4000)
         placement = Placement.at(rotation[b : b + 1], torch.zeros(1, 3), state[b : b + 1])
-        placement.lean[..., 0] = lean * (-1) ** b
+        placement.deviation[..., 0] = deviation * (-1) ** b
         with torch.no_grad():
             points, normals = (x[0] for x in whole.place(placement))
         seen = ((camera[b] - points) * normals).sum(-1) > 0
@@ -84,4 +85,4 @@ def sighted(count: int, seed: int = 0, lean: float = 0.0) -> tuple[Views, Placem
         clouds.append((kept - centre)[torch.randperm(600, generator=g)])
         camera[b] -= centre
         placements.append(replace(placement, translation=-centre[None]))
-    return observe(torch.stack(clouds), camera), Placement.cat(placements)
+    return observe(torch.stack(clouds), camera), cat(placements)

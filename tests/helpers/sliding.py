@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scapo.geometry.rigid import random_rotations
 from scapo.registered.template import ArticulatedTemplate, Placement
-from scapo.registered.views import Views, observe
+from scapo.registered.views import PartialViews, observe
 from tests.helpers.sighted import box
 from tests.helpers.strategies import generator
 
@@ -38,7 +38,7 @@ def placements(count: int = 40) -> Placement:
     return replace(at, shift=opened[:, None, None] * OUT)
 
 
-def seen(template: ArticulatedTemplate, placement: Placement) -> Views:
+def seen(template: ArticulatedTemplate, placement: Placement) -> PartialViews:
     """Views of the placed template from in front, to the side and above."""
     away = torch.nn.functional.normalize(torch.tensor([-1.5, 0.7, 0.8]), dim=0)
     camera = 2.0 * placement.rotation @ away

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Small splits on disk, written by hand in the layout of CONTRACT 3 from random numbers."""
+"""Small splits on disk, written by hand in the layout of a split from random numbers."""
 
 from __future__ import annotations
 

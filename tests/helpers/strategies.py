@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import roma
 import torch
 from hypothesis import strategies as st
 from torch import Tensor
+
+from scapo.geometry.matrices import rotation_error
 
 BATCH_SHAPES: tuple[tuple[int, ...], ...] = ((), (1,), (3, 1, 2))
 
@@ -50,3 +53,8 @@ def joints(
     """Pivots of about a metre, unit axes and states in (-pi, pi): (*shape, 3) twice, (*shape)."""
     state = (torch.rand(shape, generator=generator(seed + 2), dtype=dtype) * 2 - 1) * torch.pi
     return normal(seed, *shape, 3, dtype=dtype), unit_vectors(seed + 1, *shape, dtype=dtype), state
+
+
+def is_rotation(matrix: torch.Tensor, tolerance: float = 1e-3) -> np.ndarray:
+    """Whether R R^T = I within `tolerance` per entry and det > 0; False for NaN."""
+    return np.asarray(rotation_error(matrix.detach().numpy()) < tolerance)

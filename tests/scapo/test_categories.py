@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The nine categories are those of CONTRACT 1, and their numbers are possible."""
+"""The nine categories are those of docs/data-format.md, and their numbers are possible."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scapo.categories import CATEGORIES, category
-from scapo.types import Category
+from scapo.categories import CATEGORIES, Category, category
 
 # name: parts, kinds of the joints, benchmark sets, diagonal of the symmetry
 TABLE = {

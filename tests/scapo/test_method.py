@@ -56,7 +56,9 @@ def test_a_whole_method_works() -> None:
     method = Guess()
     part = torch.tensor([[0, 1, 1, 1]])
     observation = Observation(points=torch.zeros(1, 4, 3))
-    step = Step(stage="all", progress=0.0, generator=torch.Generator())
+    step = Step(
+        stage="all", progress=0.0, generator=torch.Generator(), index=torch.arange(1), total=1
+    )
     labels = Labels(part=part).keep(method.supervision)
     optimiser = torch.optim.SGD(method.parameters(), lr=5.0)
     for _ in range(100):

@@ -57,7 +57,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere: expected a run folder, a checkpoint or a cat"):
         load("nowhere")
     write_checkpoint(tmp_path / WEIGHTS, tiny(), checkpoint_header("other", TINY, "laptop", {}))
-    with pytest.raises(StoreError, match="expected method 'scapo' or 'registered', found 'other'"):
+    with pytest.raises(StoreError, match="expected a method of scapo, registered, found 'other'"):
         load(tmp_path)
 
 

@@ -32,7 +32,7 @@ from sim_assets.generation.request import make_request
 from sim_assets.options import DataOptions
 from sim_assets.procedural import generate
 from sim_assets.rendering.backends import make_renderer
-from sim_assets.sampling.samples import Shooter
+from sim_assets.sampling.samples import SampleMaker
 from sim_assets.sampling.viewpoints import Outline, View, draw_views, generator
 
 OBJECTS, EACH, ROUNDS = 4, 50, 5
@@ -87,9 +87,9 @@ def our_loop(category: str, seed: int) -> float:
     with make_renderer("sapien") as renderer:
         started = time.process_time()
         for number, asset in enumerate(assets):
-            shooter = Shooter(renderer, asset.load(), request.settings)
+            maker = SampleMaker(renderer, asset.load(), request.settings)
             keys = [request.key(view) for view in range(number * EACH, (number + 1) * EACH)]
-            for _ in shooter.shots(keys):
+            for _ in maker.render_views(keys):
                 pass
         return (time.process_time() - started) / (OBJECTS * EACH)
 

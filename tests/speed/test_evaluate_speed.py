@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from bench.scoring.evaluate import Request, evaluate
+from bench.requests import Request
+from bench.scoring.evaluate import evaluate
 from bench.scoring.predictions import write_predictions
 from tests.helpers import made
 

@@ -54,7 +54,7 @@ def training_step(config: ScapoConfig, stage: str, batch: int) -> Callable[[], N
     observation, noise = Observation(points=clouds(batch)), torch.Generator().manual_seed(1)
 
     def step() -> None:
-        where = Step(stage=stage, progress=0.1, generator=noise)
+        where = Step(stage=stage, progress=0.1, generator=noise, index=torch.arange(1), total=1)
         total = torch.stack(list(model.losses(observation, Labels(), where).values())).sum()
         optimizer.zero_grad()
         total.backward()

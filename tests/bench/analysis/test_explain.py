@@ -10,22 +10,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bench import __main__ as program
-from bench.analysis.explain import (
-    LADDER_COLUMNS,
-    STRATA_COLUMNS,
-    Ladder,
-    helps_most,
-    measure,
-    plot_ladder,
-    plot_strata,
-)
+from bench.analysis.explain import LADDER_COLUMNS, STRATA_COLUMNS, Ladder, measure
 from bench.analysis.ladder import RUNGS, Rung, ladder_markdown, limits
 from bench.analysis.reference import write_reference
 from bench.analysis.strata import factors, stratify
-from bench.scoring.evaluate import Request, evaluate
+from bench.figures.explain import helps_most, plot_ladder, plot_strata
+from bench.requests import Request, Settings
+from bench.scoring.evaluate import evaluate
 from bench.scoring.predictions import write_predictions
 from bench.scoring.score_files import read_scores
-from bench.scoring.scores import Settings
 from bench.scoring.truth import blocks
 from bench.statistics import Interval
 from scapo.store import StoreError, open_split
@@ -199,7 +192,7 @@ def test_references_bracket_a_method(split, tmp_path):
         (scores[kind],) = read_scores(tmp_path / f"{kind}.csv.gz")
     for found in scores.values():
         assert all(np.isfinite(v).all() for v in found.errors.values())
-        assert found.report["supervision"] == ["joint", "pose", "segmentation"]
+        assert found.report.supervision == ("joint", "pose", "segmentation")
     oracle, constant = (scores[k].errors for k in ("oracle-pose", "constant"))
     assert oracle["iou", "1"].mean() > constant["iou", "1"].mean()
     if split.manifest.joints[0].kind == "prismatic":  # no swap: the true base pose, exactly

@@ -26,7 +26,7 @@ from bench.analysis.stability import (
     scatter,
     summary,
 )
-from bench.cli.stability import quantity, tables
+from bench.cli.console import quantity, stability_tables
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from tests.helpers.splits import write_split
 from tests.helpers.tiny import TINY, tiny
@@ -255,7 +255,7 @@ def test_the_command_writes_a_report_and_a_table(tmp_path, capsys) -> None:
     assert len(fast["resampling"]["pivot_r4_mad"]["per_sample"]) == 4
     assert "Report: " in capsys.readouterr().out
     console = Console(width=120, record=True)
-    for found in tables(fast, "tiny"):
+    for found in stability_tables(report):
         console.print(found)
     printed = console.export_text()
     for text in ("median / p95", "turned", "resampled", "pivot, r4", "MAD, p95"):

@@ -33,7 +33,7 @@ from bench.figures.template import (
     template_picture,
     template_shape,
 )
-from bench.scoring.evaluate import Request
+from bench.requests import Request
 from bench.scoring.predictions import write_predictions
 from scapo.categories import category
 from scapo.registered.method import RegisteredConfig, RegisteredScapo

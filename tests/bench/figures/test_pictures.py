@@ -65,7 +65,9 @@ def test_predictions_picture_colours_both_parts_and_the_predicted_axis(tmp_path:
     truth = split.arrays("points", "part", "joint_pivot", "joint_axis", "joint_state")
     part = np.where(truth["part"] == 255, 0, truth["part"]).astype(np.uint8)
     predictions = tmp_path / "p.safetensors"
-    header = {"format": store.PREDICTIONS, "method": "mine", "category": "laptop"}
+    header = {"format": store.PREDICTIONS, "method": "mine", "category": "laptop", "variant": "",
+              "split": "train", "seed": 1, "data_digest": split.manifest.digest,
+              "supervision": []}  # fmt: skip
     store.write(
         predictions,
         {"part": part, "joint_pivot": truth["joint_pivot"], "joint_axis": truth["joint_axis"]},

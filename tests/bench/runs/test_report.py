@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -12,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from bench.runs.report import commands, read_metrics, stages_table, write_report
+from bench.run_files import METRICS, read_metrics, read_timing
+from bench.runs.report import commands, stages_table, write_report
 from scapo.store import provenance
 from scapo.store.checkpoint import read_checkpoint
 from scapo.store.schema import StoreError
 from scapo.training import fit
-from scapo.training.run_folder import TIMING
 from tests.helpers.tiny import tiny, tiny_data
 from tests.scapo.training.test_fit import CONFIG
 
@@ -85,10 +84,10 @@ def test_it_says_what_was_run(run: Path) -> None:
 
 
 def test_time_per_stage_adds_up(run: Path) -> None:
-    timing = json.loads((run / TIMING).read_text())
-    assert timing["seconds"] == pytest.approx(sum(timing["stage_seconds"].values()))
-    rows = Page(stages_table(timing, read_metrics(run))).words
-    assert rows[4:7] == ["canonicalise", "6", f"{timing['stage_seconds']['canonicalise']:.1f}"]
+    timing = read_timing(run)
+    assert timing.seconds == pytest.approx(sum(timing.stage_seconds.values()))
+    rows = Page(stages_table(timing, read_metrics(run / METRICS))).words
+    assert rows[4:7] == ["canonicalise", "6", f"{timing.stage_seconds['canonicalise']:.1f}"]
     assert rows[8:10] == ["articulate", "6"]
     assert rows[12:14] == ["all", "12"]
 

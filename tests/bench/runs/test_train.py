@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from bench.__main__ import main
+from bench.cli.verbs import prepare
 from bench.methods import METHODS, load
 from bench.runs.predict import to_arrays
-from bench.runs.train import pick_device, prepare
+from bench.runs.train import pick_device
 from bench.scoring.predictions import Predictions, read_prediction_header
 from scapo.method import OracleMethod
 from scapo.paper.method import Scapo
@@ -32,7 +33,7 @@ SMALL = [
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two splits of plates in the layout of CONTRACT 3."""
+    """Two splits of plates in the layout of a split."""
     folder = tmp_path_factory.mktemp("data")
     for split, count in (("train", 12), ("test", 5)):
         observation, labels = plates(count, 64, seed=count)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from bench.compat.readings import opalign
+from bench.requests import Request, Settings
 from bench.scoring.compat_files import check_record
-from bench.scoring.evaluate import Request, evaluate
+from bench.scoring.evaluate import evaluate
 from bench.scoring.predictions import write_predictions
-from bench.scoring.scores import Settings
 from scapo import categories
 from scapo.store import Split, StoreError
 from tests.helpers import made

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from bench import __main__ as program
 from bench.cli.verbs import VERBS
 from bench.metrics import sample_errors
-from bench.scoring.evaluate import Request, data_name, evaluate
+from bench.requests import Request, Settings
+from bench.scoring.evaluate import data_name, evaluate
 from bench.scoring.score_files import COLUMNS
-from bench.scoring.scores import Settings
 from bench.scoring.summary import passes
 from scapo import categories
 from scapo.store import Split, StoreError
@@ -207,6 +207,7 @@ def test_names_of_data(tmp_path):
         ("noisy", {"noise": "disparity"}, "noisy", "sensor"),
         ("set/sensor", {}, "set", "sensor"),
         ("set/clean", {}, "set/clean", "clean"),
+        ("set/complete", {}, "set/complete", "complete"),
         ("named", {"benchmark": "sim-art/1/sensor"}, "named", "sim-art/1/sensor"),
     ):
         split = made.make_data(tmp_path / folder, "laptop", count=3, train=3, options=options)

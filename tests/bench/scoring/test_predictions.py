@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.scoring.evaluate import Request, evaluate
+from bench.requests import Request
+from bench.scoring.evaluate import evaluate
 from bench.scoring.predictions import (
     WEIGHT_TOLERANCE,
     Predictions,

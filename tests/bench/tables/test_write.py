@@ -200,7 +200,7 @@ def test_ablations_by_the_end_of_the_variant(built):
 
 def test_significance(scores, tmp_path):
     folder, kept = scores
-    tables.write(load(folder), tmp_path)
+    tables.make_tables(folder, tmp_path)
     text = (tmp_path / "significance.csv").read_text()
     rows = list(csv.DictReader(text.splitlines()))
     row = next(r for r in rows if (r["first"], r["second"], r["metric"]) ==
@@ -223,7 +223,7 @@ def test_latex_compiles_and_golden(scores, tmp_path, repository, update_golden):
     if program_ is None:
         pytest.skip("no pdflatex on this machine")
     folder, _ = scores
-    tables.write(load(folder), tmp_path)
+    tables.make_tables(folder, tmp_path)
     for number in (1, 2, 3, 4):
         command = [program_, "-interaction=nonstopmode", "-halt-on-error", f"table{number}.tex"]
         done = subprocess.run(
@@ -263,19 +263,6 @@ def test_names_cannot_break_latex():
         r"50\% of\_\$x \& \{y\}\textasciitilde{}\#\textbackslash{}\textasciicircum{}"
     )
     assert escape("é") == "?"
-
-
-def test_without_the_json_the_numbers_are_the_same(scores, tmp_path):
-    folder, kept = scores
-    for path in folder.glob("clean-laptop-icp-*"):
-        shutil.copy(path, tmp_path)
-    for path in tmp_path.glob("*.json"):
-        path.unlink()
-    table = tables.build(load(tmp_path))[0]
-    row = one(table, block=table.blocks[3].heading, method="ICP", source="ours", column="Laptop")
-    assert float(row["value"]) == pytest.approx(kept["icp"]["part_rotation", "deg"].mean())
-    assert row["pose"] == ""  # its supervision is not known, so it is not ranked
-    assert row["best"] == "0"
 
 
 def test_the_commands(scores, tmp_path, capsys):

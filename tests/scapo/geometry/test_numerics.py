@@ -3,9 +3,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import torch
 
-from scapo.geometry.numerics import at_least_float32, exact, matrix_products, uncompiled
+from scapo.geometry.numerics import (
+    at_least_float32,
+    before_compiling,
+    exact,
+    matrix_products,
+    uncompiled,
+)
 from scapo.geometry.points import nearest
 from scapo.geometry.rigid import project_rotation
 from scapo.paper.autoencoder import Encoder, EncoderConfig
@@ -44,5 +53,21 @@ def test_double_stays_double() -> None:
     assert at_least_float32(A.half()).dtype == torch.float32
 
 
-def test_an_uncompiled_function_is_the_same_function() -> None:
-    assert uncompiled(lambda x: 2 * x)(3) == 6
+def test_an_uncompiled_function_runs_as_it_is_inside_a_compiled_one() -> None:
+    traced: list[bool] = []
+
+    def twice(x: torch.Tensor) -> torch.Tensor:
+        traced.append(torch.compiler.is_compiling())
+        return torch.from_numpy(2 * x.numpy())
+
+    held = uncompiled(twice)
+    before_compiling()
+    compiled = torch.compile(lambda x: held(x + 1) - 1, backend="eager")
+    assert compiled(torch.ones(3)).tolist() == [3.0, 3.0, 3.0]
+    assert held(torch.ones(1)).tolist() == [2.0]
+    assert traced == [False, False]
+
+
+def test_no_compiler_is_loaded_before_it_is_asked_for() -> None:
+    code = "import sys, scapo.geometry.points; sys.exit('torch._dynamo' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60, check=False).returncode == 0

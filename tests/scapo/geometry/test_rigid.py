@@ -16,6 +16,7 @@ from scapo.geometry import rigid as geometry
 from tests.helpers.strategies import (
     batch_shapes,
     generator,
+    is_rotation,
     joints,
     normal,
     rigid_motions,
@@ -139,7 +140,7 @@ def test_empty_batches_pass_through() -> None:
     matrices = torch.zeros(0, 3, 3)
     assert geometry.rotation_angle(matrices, matrices).shape == (0,)
     assert geometry.project_rotation(matrices).shape == (0, 3, 3)
-    assert geometry.is_rotation(matrices).shape == (0,)
+    assert is_rotation(matrices).shape == (0,)
     assert geometry.random_rotations(0, generator(0)).shape == (0, 3, 3)
 
 

@@ -18,6 +18,7 @@ from scapo.geometry import rigid as geometry
 from tests.helpers.strategies import (
     batch_shapes,
     generator,
+    is_rotation,
     normal,
     rotations,
     seeds,
@@ -97,7 +98,7 @@ def test_rotation_between_opposite_coordinate_axes(row: list[float]) -> None:
     source = torch.tensor(row)
     rotation = geometry.rotation_between(source, -source)
     assert_close(rotation @ source, -source)
-    assert bool(geometry.is_rotation(rotation, 1e-6))
+    assert bool(is_rotation(rotation, 1e-6))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.5, np.pi / 2 + 0.1, 2.5, np.pi - 0.01])
@@ -137,7 +138,7 @@ def test_project_rotation_of_reflections_has_determinant_one(dtype: torch.dtype)
     matrices = [-torch.eye(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])), torch.zeros(3, 3)]
     found = geometry.project_rotation(torch.stack(matrices).to(dtype))
     assert_close(torch.linalg.det(found), torch.ones(3, dtype=dtype))
-    assert bool(geometry.is_rotation(found, 1e-5).all())
+    assert bool(is_rotation(found, 1e-5).all())
 
 
 @quick
@@ -162,7 +163,7 @@ def test_mean_rotation_keeps_batches_apart() -> None:
 def test_random_rotations_are_uniform() -> None:
     """The angle has density (1 - cos w) / pi, the axis and any moved vector are isotropic."""
     found = geometry.random_rotations(4000, generator(0), dtype=torch.float64)
-    assert bool(geometry.is_rotation(found, 1e-12).all())
+    assert bool(is_rotation(found, 1e-12).all())
     angle = Rotation.from_matrix(found.numpy()).magnitude()
     grid = np.linspace(0, np.pi, 2001)
     cumulative = cumulative_trapezoid((1 - np.cos(grid)) / np.pi, grid, initial=0)
@@ -181,7 +182,7 @@ def test_random_rotations_follow_their_generator() -> None:
 def test_is_rotation_refuses_what_is_none() -> None:
     good = rotations(0, dtype=torch.float32)
     bad = [-good, 1.01 * good, torch.zeros(3, 3), torch.full((3, 3), torch.nan)]
-    assert geometry.is_rotation(torch.stack([good, *bad])).tolist() == [True] + [False] * 4
-    assert bool(geometry.is_rotation(torch.eye(3, dtype=torch.float16)))
-    assert bool(geometry.is_rotation(1.0004 * good))
-    assert not bool(geometry.is_rotation(1.0004 * good, tolerance=1e-4))
+    assert is_rotation(torch.stack([good, *bad])).tolist() == [True] + [False] * 4
+    assert bool(is_rotation(torch.eye(3, dtype=torch.float16)))
+    assert bool(is_rotation(1.0004 * good))
+    assert not bool(is_rotation(1.0004 * good, tolerance=1e-4))

@@ -7,9 +7,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from scapo.geometry.rigid import is_rotation
 from scapo.paper.augment import DISTURBANCES, Disturbance, disturb, random_pose
-from tests.helpers.strategies import generator, normal
+from tests.helpers.strategies import generator, is_rotation, normal
 
 POINTS = normal(0, 3, 600, 3, dtype=torch.float32)
 

@@ -10,10 +10,9 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from scapo.geometry.rigid import is_rotation
 from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig, gram_schmidt
 from scapo.paper.vector_neurons import initialise
-from tests.helpers.strategies import generator, normal, rotations
+from tests.helpers.strategies import generator, is_rotation, normal, rotations
 
 SMALL = EncoderConfig(neighbours=8, centres=24, pool=60, width=6, branch=(8, 12, 8, 6), features=7)
 FORMS = {

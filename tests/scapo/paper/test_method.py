@@ -10,16 +10,22 @@ import torch
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
-from scapo.geometry.rigid import apply, invert, is_rotation, joint_motion
+from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Step
 from scapo.paper.autoencoder import EncoderConfig
 from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.hinged import plates
-from tests.helpers.strategies import generator, rigid_motions
+from tests.helpers.strategies import generator, is_rotation, rigid_motions
 from tests.helpers.tiny import TINY, tiny
 
 STAGES = (CANONICALISE, ARTICULATE)
+
+
+def at(stage: str, progress: float, seed: int) -> Step:
+    """Somewhere in the training; which samples it holds is nothing to this method."""
+    index = torch.arange(1)
+    return Step(stage=stage, progress=progress, generator=generator(seed), index=index, total=1)
 
 
 def trained(steps: int = 8, category: str = "laptop") -> Scapo:
@@ -32,7 +38,7 @@ def trained(steps: int = 8, category: str = "laptop") -> Scapo:
         model.start(stage, observation, Labels(), generator(1))
         model.train()
         for k in range(steps):
-            step = Step(stage=stage, progress=0.6, generator=generator(k))
+            step = at(stage, 0.6, k)
             optimizer.zero_grad()
             torch.stack(list(model.losses(observation, Labels(), step).values())).sum().backward()
             optimizer.step()
@@ -172,7 +178,7 @@ def test_the_record_places_joints_as_the_published_evaluator_does() -> None:
 
 def test_labels_change_nothing_unless_supervised() -> None:
     observation, labels = plates(8, 96)
-    step = Step(stage=ARTICULATE, progress=0.1, generator=generator(0))
+    step = at(ARTICULATE, 0.1, 0)
     plain = tiny()
     kept = labels.keep(plain.supervision)
     assert kept == Labels()
@@ -193,7 +199,7 @@ def test_supervised_joints_do_not_depend_on_the_random_pose() -> None:
         model.losses(
             observation,
             labels.keep(model.supervision),
-            Step(stage=ARTICULATE, progress=0.1, generator=generator(seed)),
+            at(ARTICULATE, 0.1, seed),
         )["labelled_joints"]
         for seed in (1, 2)
     ]
@@ -227,7 +233,7 @@ def test_the_frozen_half_leaves_batch_statistics_alone() -> None:
     model, observation = tiny(), plates(8, 96)[0]
     model.train()
     before = {k: v.clone() for k, v in model.encoder.state_dict().items()}
-    step = Step(stage=ARTICULATE, progress=0.2, generator=generator(0))
+    step = at(ARTICULATE, 0.2, 0)
     model.losses(observation, Labels(), step)
     assert all(torch.equal(v, before[k]) for k, v in model.encoder.state_dict().items())
     model.losses(observation, Labels(), replace(step, progress=0.6))
@@ -242,7 +248,7 @@ def test_losses_repeat_from_their_generator(stage: str) -> None:
     for _ in range(2):
         model = tiny()
         model.train()
-        step = Step(stage=stage, progress=0.6, generator=generator(7))
+        step = at(stage, 0.6, 7)
         found.append(model.losses(observation, Labels(), step))
     assert list(found[0]) == list(found[1])
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
@@ -270,7 +276,7 @@ def test_both_stages_learn() -> None:
         model.train()
         history = []
         for k in range(30):
-            step = Step(stage=stage, progress=0.1, generator=generator(k))
+            step = at(stage, 0.1, k)
             terms = model.losses(observation, Labels(), step)
             optimizer.zero_grad()
             torch.stack(list(terms.values())).sum().backward()

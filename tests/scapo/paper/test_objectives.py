@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, joint_motion
 from scapo.paper.autoencoder import Encoding
 from scapo.paper.heads import JointPairs
@@ -24,7 +25,6 @@ from scapo.paper.objectives import (
     weigh,
 )
 from scapo.paper.skinning import Bones
-from scapo.types import JointKind
 from tests.helpers.strategies import normal
 
 BASE = {"cycle", "cycle_template", "recon", "recon_template", "kp_seg", "seg", "base_gap"}

@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from scapo.categories import JointKind
 from scapo.paper.refine import misfit, moved, refine
-from scapo.types import JointKind, Observation
+from scapo.types import Observation
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import normal
 from tests.helpers.tiny import tiny

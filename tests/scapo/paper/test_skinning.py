@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply
 from scapo.paper import skinning
 from scapo.paper.heads import JointPairs
-from scapo.types import JointKind
 from tests.helpers.strategies import normal, seeds, unit_vectors
 
 quick = settings(max_examples=15, deadline=None)

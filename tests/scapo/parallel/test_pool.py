@@ -6,10 +6,11 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
-from scapo.parallel.pool import ONE_THREAD, Pool, _cause, describe_error
+from scapo.parallel.pool import ONE_THREAD, TRIES, Pool, _cause, describe_error
 
 
 def act(job: tuple[str, int], report) -> object:
@@ -64,6 +65,48 @@ def test_a_job_that_fails_dies_or_hangs_costs_that_job_only():
     }
     assert outcomes["environment", 7].result == dict.fromkeys(ONE_THREAD, "1")
     assert ("square 1", 1) in heard
+
+
+def struck(job: tuple[Path, str], report) -> list[int]:
+    """Die or stop at each place as often as the file for it has lines."""
+    folder, name = job
+    for place in ("first", "second"):
+        report(f"{name} {place}", 1)
+        marks = folder / f"{name}-{place}"
+        left = marks.read_text().splitlines() if marks.exists() else []
+        with (folder / "log").open("a") as log:
+            log.write(f"{os.getpid()} {name}\n")
+        if left:
+            marks.write_text("\n".join(left[1:]))
+            os.kill(os.getpid(), signal.Signals[left[0]])
+    others = [line for line in (folder / "log").read_text().splitlines() if name not in line]
+    return [int(line.split()[0]) for line in others]
+
+
+def test_a_job_whose_process_is_lost_is_done_again_alone(tmp_path: Path):
+    """Killed twice at one place and twice at another, or stopped once: the result is there."""
+    (tmp_path / "a-first").write_text("SIGKILL\nSIGKILL")
+    (tmp_path / "a-second").write_text("SIGKILL\nSIGKILL")
+    (tmp_path / "b-first").write_text("SIGSTOP")
+    (tmp_path / "d-second").write_text("SIGKILL\n" * 9)
+    amounts: dict[str, int] = {}
+
+    def heard(job: tuple[Path, str], label: str, amount: int) -> None:
+        del label
+        amounts[job[1]] = amounts.get(job[1], 0) + amount
+
+    jobs = [(tmp_path, name) for name in "abcd"]
+    with Pool(2, timeout=2.5) as pool:
+        outcomes = {outcome.job[1]: outcome for outcome in pool.run(struck, jobs, heard)}
+    assert [name for name in "abcd" if outcomes[name].failure] == ["d"]
+    assert (outcomes["d"].failure, outcomes["d"].label) == ("died", "d second")
+    assert outcomes["d"].reason == "its process was ended by SIGKILL"
+    assert [amounts[name] for name in "abc"] == [2, 2, 2]  # what was lost is taken back
+    log = [line.split() for line in (tmp_path / "log").read_text().splitlines()]
+    used = {name: list(dict.fromkeys(pid for pid, who in log if who == name)) for name in "abcd"}
+    assert [len(used[name]) for name in "abcd"] == [5, 2, 1, TRIES]  # a fresh process each time
+    again = [pid for name in "abd" for pid in used[name][1:]]
+    assert len(set(again)) == len(again)
 
 
 def test_a_run_that_is_left_before_its_end_leaves_nothing_to_the_next():

@@ -129,7 +129,7 @@ def make(folder: Path, running: Running) -> Made:
     ]
     if running.engine == "local":
         (folder / "gate").touch()
-    found = versions(request.settings.backend, "full")
+    found = versions(request.settings.backend)
     return generate(request, assets, folder / "split", found, running)
 
 
@@ -228,7 +228,7 @@ def test_a_machine_that_would_make_other_pixels_is_refused(tmp_path):
         request=request,
         plan=plan_shards(request, entries, 1)[0],
         options={},
-        versions=versions(request.settings.backend, "full"),
+        versions=versions(request.settings.backend),
         strict=True,
     )
     silent = lambda label, amount: None  # noqa: E731

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Tilts of a flap are measured, and a template of flaps that lean is found; straight ones stay."""
+"""Rotations of a flap are observed; a template of flaps whose axes deviate is found, no other."""
 
 from __future__ import annotations
 
@@ -10,49 +10,50 @@ import roma
 import torch
 from torch.testing import assert_close
 
+from scapo.records import take
 from scapo.registered.axis_deviation import (
     REACHES,
-    leaning_templates,
-    measure,
+    deviating_templates,
+    observe_part_rotations,
+    refine_deviations,
+    rotated_poses,
     seat_pivots,
-    settle_leans,
     spread_across,
-    tilted,
+    with_axis_deviation,
 )
-from scapo.registered.bundle_adjustment import FitOptions
-from scapo.registered.discovery import with_leans
-from scapo.registered.initialisation import DiscoveryConfig, Trusted
+from scapo.registered.bundle_adjustment import Candidate, FitOptions, Inliers
+from scapo.registered.config import DiscoveryConfig
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
-LEAN = 0.15
+ASIDE = 0.15
 
 
-def test_the_tilt_of_a_leaning_flap_is_measured() -> None:
-    views, truth = sighted(16, seed=5, lean=LEAN)
+def test_the_rotation_of_a_flap_whose_axis_deviates_is_observed() -> None:
+    views, truth = sighted(16, seed=5, deviation=ASIDE)
     made = template()
-    straight = replace(truth, lean=torch.zeros_like(truth.lean))
-    tilts = measure(made, views, straight, REACHES)
+    straight = replace(truth, deviation=torch.zeros_like(truth.deviation))
+    observed = observe_part_rotations(made, views, straight, REACHES)
     base = truth.rotation.mT
-    leaning, upright = (base @ made.part_poses(at).rotation[:, 1] for at in (truth, straight))
-    turn = roma.rotmat_to_rotvec(upright.mT @ leaning)
-    got = spread_across(tilts.turn, made)[:, 0]
-    off = (got - turn)[tilts.seen[:, 0], 0]  # out of the flap's plane, which its points tell
-    assert tilts.seen.float().mean() > 0.8
+    aside, upright = (base @ made.part_poses(at).rotation[:, 1] for at in (truth, straight))
+    turn = roma.rotmat_to_rotvec(upright.mT @ aside)
+    got = spread_across(observed.turn, made)[:, 0]
+    off = (got - turn)[observed.seen[:, 0], 0]  # out of the flap's plane, which its points tell
+    assert observed.seen.float().mean() > 0.8
     assert off.abs().max() < 0.012
     assert turn[:, 0].abs().max() > 0.05
 
 
-def test_parts_are_posed_as_tilted_about_their_pivot() -> None:
+def test_parts_are_posed_as_rotated_about_their_pivot() -> None:
     views, truth = sighted(6, seed=5)
     made = template()
-    tilts = measure(made, views, truth, REACHES)
-    tilts.turn[:, 0] = torch.tensor(
+    observed = observe_part_rotations(made, views, truth, REACHES)
+    observed.turn[:, 0] = torch.tensor(
         [[0.1, 0.0], [-0.1, 0.0], [0.0, 0.2], [0, -0.2], [2, 0], [-2, 0]]
     )
-    tilts.seen[:4] = True
-    tilts.seen[4:] = False
-    poses, straight = tilted(made, truth, tilts), made.part_poses(truth)
+    observed.seen[:4] = True
+    observed.seen[4:] = False
+    poses, straight = rotated_poses(made, truth, observed), made.part_poses(truth)
     turn = roma.rotmat_to_rotvec(straight.rotation[:, 1].mT @ poses.rotation[:, 1])
     assert_close(turn.norm(dim=-1), torch.tensor([0.1, 0.1, 0.2, 0.2, 0, 0]), atol=1e-4, rtol=1e-3)
     for one in (poses, straight):
@@ -71,25 +72,26 @@ def test_pivots_slide_to_their_part() -> None:
 
 
 @pytest.mark.slow
-def test_flaps_that_lean_are_found_and_told() -> None:
-    views, truth = sighted(48, seed=8, lean=LEAN)
-    straight = replace(truth, lean=torch.zeros_like(truth.lean))
+def test_axes_that_deviate_are_found_and_told() -> None:
+    views, truth = sighted(48, seed=8, deviation=ASIDE)
+    straight = replace(truth, deviation=torch.zeros_like(truth.deviation))
     index = torch.arange(48)
     held, rest = index[::3], index[index % 3 > 0]
     config = DiscoveryConfig(rotations=300)
-    trusted = Trusted(views=views.take(rest), placement=straight.take(rest))
-    found, _ = with_leans((template(), trusted), views.take(held), config, generator(0))
-    assert found.leans()
-    placed, loss = settle_leans(found, views.take(held), straight.take(held))
-    got, true = (at.rotation @ found.leaning(at).mT for at in (placed, truth.take(held)))
+    inliers = Inliers(views=take(views, rest), placement=take(straight, rest))
+    start = Candidate(template=template(), inliers=inliers)
+    found = with_axis_deviation(start, take(views, held), config, generator(0)).template
+    assert found.deviates()
+    placed, loss = refine_deviations(found, take(views, held), take(straight, held))
+    got, true = (at.rotation @ found.own_directions(at).mT for at in (placed, take(truth, held)))
     angle = torch.rad2deg((got * true).sum(1).clamp(max=1).arccos())
-    assert angle.mean() < 4.0 < torch.rad2deg(torch.tensor(LEAN))
-    _, before = settle_leans(template(), views.take(held), straight.take(held))
+    assert angle.mean() < 4.0 < torch.rad2deg(torch.tensor(ASIDE))
+    _, before = refine_deviations(template(), take(views, held), take(straight, held))
     assert loss.mean() < before.mean()
 
 
 @pytest.mark.slow
-def test_straight_flaps_make_no_leaning_template() -> None:
+def test_axes_that_do_not_deviate_make_no_template() -> None:
     views, truth = sighted(24, seed=9)
-    options = FitOptions(steps=5)
-    assert not leaning_templates(template(), views, truth, options, generator(0))
+    start = Candidate(template=template(), inliers=Inliers(views=views, placement=truth))
+    assert not deviating_templates(start, FitOptions(steps=5), generator(0))

@@ -12,25 +12,26 @@ from torch.testing import assert_close
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply, invert, joint_motion, random_rotations
 from scapo.registered.decode import canonical_points, nearest_weights, placed_prediction, smoothed
-from scapo.registered.template import ArticulatedTemplate, Placement, slides
+from scapo.registered.template import Placement
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
 
-@pytest.mark.parametrize("lean", [0.0, 0.2])
+@pytest.mark.parametrize("deviation", [0.0, 0.2])
 @torch.no_grad()
-def test_parts_and_joint_of_a_prediction_belong_together(lean: float):
+def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
     cloud = torch.randn(3, 50, 3, generator=generator(0)) + torch.tensor([0, 0, 4.0])
     _, similarity = normalise(cloud)
     rotation = random_rotations(3, generator(1))
     state = torch.tensor([[0.2], [0.7], [1.1]])
     placement = Placement.at(rotation, 0.1 * torch.randn(3, 3, generator=generator(2)), state)
-    placement = replace(placement, lean=lean * torch.randn(3, 1, 3, generator=generator(3)))
+    aside = deviation * torch.randn(3, 1, 3, generator=generator(3))
+    placement = replace(placement, deviation=aside)
     shape = template()
-    aside = torch.tensor([0.1, 0.2, -0.1])  # part frames sit at the base's middle, not the origin
-    shape.points.add_(aside)
-    shape.pivot.add_(aside)
-    if lean:
+    away = torch.tensor([0.1, 0.2, -0.1])  # part frames sit at the base's middle, not the origin
+    shape.points.add_(away)
+    shape.pivot.add_(away)
+    if deviation:
         shape.rest.fill_(-0.3)
         shape.load.fill_(0.1)
     weight = torch.full((3, 50, 2), 0.5)
@@ -57,11 +58,6 @@ def test_parts_and_joint_of_a_prediction_belong_together(lean: float):
         assert_close(carried, points[:, own], atol=2e-3, rtol=0)
     still = canonical_points(shape, placement)
     assert_close(still[0], still[2], atol=1e-6, rtol=0)
-
-
-def test_slides_are_marked():
-    shape = ArticulatedTemplate(("revolute", "prismatic"), 5)
-    assert slides(shape).tolist() == [[0.0], [1.0]]
 
 
 def test_weights_come_from_the_part_that_is_there():

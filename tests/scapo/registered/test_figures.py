@@ -6,14 +6,14 @@ from __future__ import annotations
 import torch
 
 from scapo.registered.figures import template_pictures
-from scapo.registered.joint_limits import StateRange
+from scapo.registered.joint_limits import JointLimits
 from scapo.registered.template import Placement
 from tests.helpers.sighted import template
 
 
 def test_the_template_opens_and_lies_on_its_own_points():
     made = template()
-    states = StateRange(low=torch.zeros(1), high=torch.ones(1), unit=torch.ones(1))
+    states = JointLimits(low=torch.zeros(1), high=torch.ones(1), unit=torch.ones(1))
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))[None]
     placement = Placement.at(turn, torch.tensor([[0.1, 0.0, 0.0]]), torch.tensor([[0.4]]))
     with torch.no_grad():

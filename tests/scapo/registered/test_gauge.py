@@ -1,19 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""A sliding part's axis: the way out of the body, not the way in which its place differs most."""
+"""The gauge: a sliding part's axis is the way out of the body, the frame that of the base."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import pytest
+import roma
 import torch
-from torch import Tensor
 from torch.testing import assert_close
 
-from scapo.registered.bundle_adjustment import across_axis, search_states
-from scapo.registered.gauge import choose_axes, protrusion
+from scapo.geometry.rigid import random_rotations
+from scapo.registered.gauge import (
+    along_main_directions,
+    choose_axes,
+    principal_frame,
+    protrusion,
+    tells_frame,
+)
 from scapo.registered.template import ArticulatedTemplate, Placement
-from tests.helpers.sliding import OUT, UP, cabinet, placements, seen
+from tests.helpers.sighted import AXIS, template
+from tests.helpers.sliding import OUT, UP, cabinet, placements
 from tests.helpers.strategies import generator
 
 
@@ -65,20 +72,55 @@ def test_revolute_joints_are_left_alone():
     assert torch.equal(found.state, start.state)
 
 
-@pytest.mark.parametrize("axis", [OUT, UP, torch.tensor([0.6, 0.0, 0.8])])
-def test_across_an_axis(axis: Tensor):
-    frame = torch.stack([axis, *across_axis(axis)])
-    assert_close(frame @ frame.T, torch.eye(3))
+def test_the_frame_follows_most_normals():
+    turn = random_rotations(1, generator(1))[0]
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).repeat(20, 1)
+    noise = 0.05 * torch.randn(120, 3, generator=generator(2))
+    frame = principal_frame(torch.nn.functional.normalize(axes @ turn.T + noise, dim=-1))
+    aligned = (frame @ turn).abs()
+    assert aligned.amax(1).min() > 0.995
+    assert torch.allclose(torch.linalg.det(frame), torch.tensor(1.0), atol=1e-4)
 
 
-def test_the_place_of_a_sliding_part_is_searched_too():
-    template, truth = cabinet(OUT), placements(4)
-    truth = replace(truth, state=torch.full((4, 1), 0.1), shift=truth.state[..., None] * UP)
-    views = seen(cabinet(OUT, 7, 4000), truth)
-    lost = replace(truth, shift=torch.zeros_like(truth.shift))
-    found = lost
-    for _ in range(2):  # the state was first sought at a wrong place
-        found = search_states(template, views, found, torch.linspace(-0.2, 0.2, 9)[None], 120.0)
-    assert (truth.shift.norm(dim=-1) > 0.1).any()
-    assert (found.shift - truth.shift).norm(dim=-1).max() < 0.04
-    assert (found.state - truth.state).abs().max() < 0.06
+@torch.no_grad()
+def test_the_frame_turns_back_to_the_main_directions_of_the_base():
+    shape, start = (
+        template(),
+        Placement.at(random_rotations(3, generator(1)), torch.zeros(3, 3), torch.zeros(3, 1)),
+    )
+    before, _ = shape.place(start)
+    aside = roma.rotvec_to_rotmat(torch.tensor([0.15, -0.1, 0.2]))
+    for vectors in (shape.points, shape.normals, shape.axis, shape.pivot):
+        vectors.copy_(vectors @ aside.T)
+    turned = replace(start, rotation=start.rotation @ aside.T)
+    found = along_main_directions(shape, turned)
+    assert tells_frame(shape)
+    assert_close(found.rotation, start.rotation, atol=2e-3, rtol=0)
+    assert_close(shape.directions()[0], AXIS, atol=2e-3, rtol=0)
+    assert_close(shape.place(found)[0], before, atol=1e-4, rtol=0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("degrees", [30.0, 45.0])
+def test_the_frame_of_a_plate_follows_its_normal_and_its_hinge(degrees: float):
+    g = generator(7)
+    points = torch.rand(300, 3, generator=g) * torch.tensor([0.6, 0.4, 0.0])
+    up = (torch.rand(300, 1, generator=g) < 0.5) * 2.0 - 1
+    normals = up * torch.tensor([0.0, 0.0, 1.0]) + 0.05 * torch.randn(300, 3, generator=g)
+    plate = ArticulatedTemplate(("revolute",), 300)
+    plate.assign(
+        points,
+        torch.nn.functional.normalize(normals, dim=-1),
+        torch.tensor([[8.0, 0.0]]).expand(300, 2),
+    )
+    plate.axis.copy_(torch.tensor([[0.8, 0.6, 0.0]]))
+    turn = roma.rotvec_to_rotmat(torch.deg2rad(torch.tensor([degrees, 0.0, 0.0])))
+    for vectors in (plate.points, plate.normals, plate.axis):
+        vectors.copy_(vectors @ turn.T)
+    start = Placement.at(random_rotations(2, g), torch.zeros(2, 3), torch.zeros(2, 1))
+    before, _ = plate.place(start)
+    found = along_main_directions(plate, start)
+    assert not tells_frame(plate)
+    assert plate.normals.abs().mean(0).max() > 0.98
+    assert plate.directions()[0].abs().max() > 0.999
+    assert_close(plate.place(found)[0], before, atol=1e-4, rtol=0)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -12,11 +14,16 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.points import squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Step
-from scapo.registered.initialisation import DiscoveryConfig
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.config import DiscoveryConfig
+from scapo.registered.method import RegisteredConfig, RegisteredScapo, cpu_config
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
+
+
+def at(progress: float, index: Tensor, g: torch.Generator) -> Step:
+    """Where a batch of these clouds is, of twelve in all."""
+    return Step(stage="votes", progress=progress, generator=g, index=index, total=12)
 
 
 def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
@@ -34,9 +41,7 @@ def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
     optimiser = torch.optim.Adam(method.network.parameters(), 3e-3)
     g = generator(1)
     for step in range(steps):
-        terms = method.losses(
-            observation, Labels(), Step(stage="votes", progress=step / steps, generator=g)
-        )
+        terms = method.losses(observation, Labels(), at(step / steps, torch.arange(12), g))
         optimiser.zero_grad()
         torch.stack(list(terms.values())).sum().backward()
         optimiser.step()
@@ -126,3 +131,39 @@ def test_pictures_show_the_template_on_the_clouds():
     assert first.beneath is not None
     gap = squared_distances(first.beneath[None], first.points[None]).sqrt()
     assert gap.median() < 0.2
+
+
+def test_a_batch_is_told_by_its_samples_alone():
+    method, observation = trained(0)
+    some = torch.tensor([7, 2])
+    points = observation.points[some].clone()
+    points[:, 0] = points[0, 1]  # clouds that begin with the same point
+    batch = Observation(points=points)
+    own = method.losses(batch, Labels(), at(0.0, some, generator(3)))
+    other = method.losses(batch, Labels(), at(0.0, some.flip(0), generator(3)))
+    assert (other["votes"] - own["votes"]).abs() > 1e-3
+
+
+def test_of_many_clouds_only_the_learned_ones_have_placements():
+    method, observation = trained(0)
+    few = RegisteredScapo(replace(method.config, learned=3), method.category, generator(0))
+    few.load_state_dict(method.state_dict())  # of 12 clouds, 0, 5 and 11 are learned
+    row = torch.tensor([11, 0])
+    batch = Observation(points=observation.points[row])
+    assert few._learned_row(at(0.0, row, generator(0))).tolist() == [2, 0]
+    with pytest.raises(ValueError, match="expected clouds whose placements were found"):
+        few.losses(batch, Labels(), at(0.0, row - 1, generator(0)))
+
+
+def variant(config: RegisteredConfig) -> str:
+    return RegisteredScapo(config, CATEGORIES["oven"], generator(0)).variant
+
+
+def test_departures_are_named_and_a_shorter_training_is_not() -> None:
+    assert variant(cpu_config()) == ""
+    assert variant(RegisteredConfig(learned=20, epochs=1, lr=1.0, batch=2)) == ""
+    discovery = DiscoveryConfig(held_frame=False, range_cost=0.0)
+    config = RegisteredConfig(strays="kept", settle=False, discovery=discovery)
+    assert variant(config) == (
+        "discovery.range_cost=0.0 discovery.held_frame=False strays=kept settle=False"
+    )

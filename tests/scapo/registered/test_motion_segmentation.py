@@ -5,15 +5,15 @@ from __future__ import annotations
 
 import torch
 
-from scapo.registered.bundle_adjustment import oriented_nearest
-from scapo.registered.motion_segmentation import farthest_features, gather_evidence, rebuild, spread
+from scapo.registered.motion_segmentation import gather_evidence, rebuild, smooth
 from scapo.registered.template import Placement
-from scapo.registered.views import Views
+from scapo.registered.view_loss import oriented_nearest
+from scapo.registered.views import PartialViews
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
 
-def true_parts(views: Views, truth: Placement) -> torch.Tensor:
+def true_parts(views: PartialViews, truth: Placement) -> torch.Tensor:
     """Of the views' points, from the true template."""
     shape = template(seed=3, count=2000)
     index = oriented_nearest(views.points, views.normals, *shape.place(truth))
@@ -27,14 +27,14 @@ def test_evidence_tells_the_parts():
     evidence = gather_evidence(
         views, shape.part_poses(truth), truth.log_scale, count=96, observers=torch.arange(10)
     )
-    score = spread(views, evidence.log_support - evidence.log_support.mean(-1, keepdim=True))
+    score = smooth(views, evidence.log_support - evidence.log_support.mean(-1, keepdim=True))
     correct = score.argmax(-1) == true_parts(views, truth)[:, :96]
     assert correct.float().mean() > 0.85
 
 
 def test_smoothing_keeps_a_constant():
     views, _ = sighted(2, seed=21)
-    assert torch.allclose(spread(views, torch.full((2, 64, 2), 0.7)), torch.tensor(0.7), atol=1e-4)
+    assert torch.allclose(smooth(views, torch.full((2, 64, 2), 0.7)), torch.tensor(0.7), atol=1e-4)
 
 
 @torch.no_grad()
@@ -49,8 +49,3 @@ def test_the_template_is_rebuilt_from_the_views():
     assert off.quantile(0.9) < 0.04
     parts = shape.logit.argmax(-1) == good.logit.argmax(-1)[index]
     assert parts.float().mean() > 0.8
-
-
-def test_farthest_features_spread_out():
-    line = torch.arange(11.0)[:, None]
-    assert sorted(farthest_features(line, 3).tolist()) == [0, 5, 10]

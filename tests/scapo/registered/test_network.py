@@ -6,9 +6,9 @@ from __future__ import annotations
 import torch
 from torch.testing import assert_close
 
-from scapo.geometry.rigid import is_rotation, random_rotations
+from scapo.geometry.rigid import random_rotations
 from scapo.registered.network import PointVotes, Target, principal_frames, procrustes, vote_losses
-from tests.helpers.strategies import generator
+from tests.helpers.strategies import generator, is_rotation
 
 
 def clouds(count: int) -> torch.Tensor:

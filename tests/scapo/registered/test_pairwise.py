@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from scapo.geometry.rigid import is_rotation, random_rotations, rotation_angle
+from scapo.geometry.rigid import random_rotations, rotation_angle
 from scapo.registered.pairwise import (
     CELLS,
     EXTENT,
@@ -19,7 +19,7 @@ from scapo.registered.pairwise import (
     rotation_grid,
 )
 from tests.helpers.sighted import sighted
-from tests.helpers.strategies import generator
+from tests.helpers.strategies import generator, is_rotation
 
 
 def angles(a: Tensor, b: Tensor) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Gauss-Newton steps: derivatives against differences, perturbed placements brought back."""
+"""Refinement: derivatives against differences, perturbed placements brought back, states found."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ import pytest
 import roma
 import torch
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import random_rotations, rotation_angle
-from scapo.registered.bundle_adjustment import view_loss
-from scapo.registered.pose_refinement import StepOptions, _move, _place, settle
+from scapo.registered.pose_refinement import (
+    StepOptions,
+    _move,
+    _place,
+    refine_gauss_newton,
+    search_states,
+)
 from scapo.registered.template import ArticulatedTemplate, Placement
-from scapo.types import JointKind
+from scapo.registered.view_loss import view_loss
 from tests.helpers.sighted import sighted, template
+from tests.helpers.sliding import OUT, UP, cabinet, placements, seen
 from tests.helpers.strategies import generator
 
 
-@pytest.mark.parametrize("lean", [0.0, 0.2])
+@pytest.mark.parametrize("aside", [0.0, 0.2])
 @pytest.mark.parametrize("kinds", [("revolute", "revolute"), ("prismatic",)])
-def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], lean: float):
+def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], aside: float):
     g, joints = generator(0), len(kinds)
     made = ArticulatedTemplate(kinds, 20).double()
     with torch.no_grad():
@@ -37,7 +44,7 @@ def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], lean: 
         ),
         log_scale=0.2 * torch.randn(3, 3, generator=g).double(),
         shift=(shift - (shift * axis).sum(-1, keepdim=True) * axis) * sliding,
-        lean=lean * torch.randn(3, joints, 3, generator=g).double() * (1 - sliding),
+        deviation=aside * torch.randn(3, joints, 3, generator=g).double() * (1 - sliding),
     )
     made.rest.copy_(torch.randn(joints, generator=g))
     index = torch.arange(20).expand(3, 20)
@@ -64,10 +71,31 @@ def test_perturbed_placements_come_back():
         state=truth.state + 0.2 * torch.randn(12, 1, generator=g),
     )
     made = template()
-    found = settle(made, views, start, StepOptions(steps=12, points=192))
+    found = refine_gauss_newton(made, views, start, StepOptions(steps=12, points=192))
     errors = rotation_angle(found.rotation, truth.rotation).rad2deg()
     assert errors.median() < 2
     assert (found.state - truth.state).abs().median() < 0.04
     with torch.no_grad():
         after, before = (view_loss(views, made.place(p), 250.0) for p in (found, start))
     assert (after < before).all()
+
+
+def test_states_are_found_on_a_grid():
+    views, truth = sighted(4, seed=11)
+    start = replace(truth, state=torch.full_like(truth.state, -1.0))
+    grid = torch.linspace(-1, 1.5, 26)[None]
+    found = search_states(template(), views.thinned(torch.arange(128)), start, grid, 150.0)
+    assert (found.state - truth.state).abs().max() < 0.16
+
+
+def test_the_place_of_a_sliding_part_is_searched_too():
+    template, truth = cabinet(OUT), placements(4)
+    truth = replace(truth, state=torch.full((4, 1), 0.1), shift=truth.state[..., None] * UP)
+    views = seen(cabinet(OUT, 7, 4000), truth)
+    lost = replace(truth, shift=torch.zeros_like(truth.shift))
+    found = lost
+    for _ in range(2):  # the state was first sought at a wrong place
+        found = search_states(template, views, found, torch.linspace(-0.2, 0.2, 9)[None], 120.0)
+    assert (truth.shift.norm(dim=-1) > 0.1).any()
+    assert (found.shift - truth.shift).norm(dim=-1).max() < 0.04
+    assert (found.state - truth.state).abs().max() < 0.06

@@ -8,15 +8,16 @@ from dataclasses import replace
 import torch
 
 from scapo.geometry.rigid import rotation_angle
-from scapo.registered.joint_limits import OUTSIDE_COST, StateRange
+from scapo.registered.joint_limits import OUTSIDE_COST, JointLimits
 from scapo.registered.pairwise import rotation_grid
 from scapo.registered.pose_search import (
-    Found,
+    SearchResult,
     SearchSpace,
     best_of,
+    combinations,
+    rank_by_confidence,
+    refine_states,
     search,
-    settle_states,
-    state_grid,
 )
 from scapo.registered.template import Placement
 from tests.helpers.sighted import sighted, template
@@ -27,30 +28,31 @@ def test_known_placements_are_found():
     space = SearchSpace(
         states=torch.linspace(0, 1, 4)[None], rotations=rotation_grid(700), cameras=None, keep=8
     )
-    finalists = search(template(), views, space)
-    found = finalists.best()
+    hypotheses = search(template(), views, space)
+    free = JointLimits(low=torch.tensor([-9.0]), high=torch.tensor([9.0]), unit=torch.ones(1))
+    found = hypotheses.best(free)
     errors = rotation_angle(found.placement.rotation, truth.rotation).rad2deg()
     assert errors.median() < 8
     assert (errors < 15).sum() >= 3
     assert bool((found.margin[errors < 15] > 0.02).any())
     state = (found.placement.state - truth.state).abs()[errors < 15]
     assert state.max() < 0.2
-    high = StateRange(low=torch.tensor([3.0]), high=torch.tensor([4.0]), unit=torch.ones(1))
-    assert torch.allclose(finalists.best(high).loss, found.loss + OUTSIDE_COST)
+    high = JointLimits(low=torch.tensor([3.0]), high=torch.tensor([4.0]), unit=torch.ones(1))
+    assert torch.allclose(hypotheses.best(high).loss, found.loss + OUTSIDE_COST)
 
 
 def test_a_wrong_state_is_corrected_and_the_rest_kept():
     views, truth = sighted(4, seed=41)
     wrong = replace(truth, state=(truth.state + 0.5) % 1.0)
-    found = Found(placement=wrong, loss=torch.zeros(4), margin=torch.zeros(4))
-    states = StateRange(low=torch.zeros(1), high=torch.ones(1), unit=torch.ones(1))
-    settled = settle_states(template(), views, found, states)
-    assert (settled.state - truth.state).abs().max() < 0.15
-    assert rotation_angle(settled.rotation, truth.rotation).rad2deg().max() < 8
+    found = SearchResult(placement=wrong, loss=torch.zeros(4), margin=torch.zeros(4))
+    limits = JointLimits(low=torch.zeros(1), high=torch.ones(1), unit=torch.ones(1))
+    refined = refine_states(template(), views, found, limits)
+    assert (refined.state - truth.state).abs().max() < 0.15
+    assert rotation_angle(refined.rotation, truth.rotation).rad2deg().max() < 8
 
 
 def test_all_combinations_of_states():
-    grid = state_grid(torch.tensor([[0.0, 1], [2, 3]]))
+    grid = combinations(torch.tensor([[0.0, 1], [2, 3]]))
     assert grid.tolist() == [[0, 2], [0, 3], [1, 2], [1, 3]]
 
 
@@ -61,3 +63,11 @@ def test_the_best_and_its_margin():
     found = best_of(start, torch.tensor([0.3, 0.2, 0.5, 0.1, 0.15, 0.4]), 2)
     assert found.placement.state[:, 0].tolist() == [1, 3]
     assert torch.allclose(found.margin, torch.tensor([0.1, 0.3]))
+
+
+def test_views_are_ordered_by_confidence():
+    none = Placement.at(torch.eye(3).expand(3, 3, 3), torch.zeros(3, 3), torch.zeros(3, 1))
+    found = SearchResult(
+        placement=none, loss=torch.tensor([0.4, 0.2, 0.2]), margin=torch.tensor([0.1, 0.1, 0.3])
+    )
+    assert rank_by_confidence(found).tolist() == [2, 1, 0]

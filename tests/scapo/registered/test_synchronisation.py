@@ -7,7 +7,7 @@ import torch
 
 from scapo.geometry.rigid import random_rotations, rotation_angle
 from scapo.registered.pairwise import Modes
-from scapo.registered.synchronisation import agree
+from scapo.registered.synchronisation import synchronise
 from tests.helpers.strategies import generator
 
 
@@ -31,7 +31,7 @@ def noisy_modes(right: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor,
 
 def test_right_pairs_outvote_wrong_ones():
     rotation, translation, pairs, modes = noisy_modes(0.6)
-    found = agree(10, pairs, modes)
+    found = synchronise(10, pairs, modes)
     frame = found.rotation[0] @ rotation[0].mT
     angles = rotation_angle(found.rotation[:9], frame @ rotation[:9]).rad2deg()
     assert angles.max() < 1

@@ -8,11 +8,24 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
+from torch import Tensor
 from torch.testing import assert_close
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, joint_motion, random_rotations, rigid
-from scapo.registered.template import ArticulatedTemplate, Placement, interleave, turn_placement
-from scapo.types import JointKind
+from scapo.records import cat, take
+from scapo.registered.template import (
+    PART_LENGTH,
+    ArticulatedTemplate,
+    Placement,
+    across_axis,
+    interleave,
+    slides,
+    spread_out,
+    surface_features,
+    turn_placement,
+)
+from tests.helpers.sliding import OUT, UP
 from tests.helpers.strategies import generator
 
 
@@ -32,7 +45,7 @@ def drawn(kind: JointKind) -> tuple[ArticulatedTemplate, Placement]:
         log_scale=0.2 * torch.randn(4, 3, generator=g),
         state=torch.randn(4, 1, generator=g),
         shift=torch.randn(4, 1, 3, generator=g),
-        lean=torch.zeros(4, 1, 3),
+        deviation=torch.zeros(4, 1, 3),
     )
 
 
@@ -58,28 +71,28 @@ def test_parts_move_as_their_joint_says(kind: JointKind):
 
 
 @torch.no_grad()
-def test_a_leaning_hinge_turns_its_part_about_its_own_axis_from_its_rest():
+def test_a_hinge_turns_its_part_about_its_own_axis_from_its_rest():
     template, placement = drawn("revolute")
     template.rest.copy_(torch.tensor([0.4]))
     straight = replace(placement, shift=torch.zeros(4, 1, 3))
-    leaning = replace(straight, lean=0.2 * torch.randn(4, 1, 3, generator=generator(7)))
+    aside = replace(straight, deviation=0.2 * torch.randn(4, 1, 3, generator=generator(7)))
     at_rest = torch.full((4, 1), 0.4)
-    still = template.part_poses(replace(leaning, state=at_rest))
+    still = template.part_poses(replace(aside, state=at_rest))
     upright = template.part_poses(replace(straight, state=at_rest))
     assert_close(still.rotation, upright.rotation)
     assert_close(still.translation, upright.translation)
-    pivot, axis = (x[:, 0] for x in template.joints_in_view(leaning))
-    onward = joint_motion(pivot, axis, (leaning.state - at_rest)[:, 0], "revolute")
-    moved = template.part_poses(leaning)
+    pivot, axis = (x[:, 0] for x in template.joints_in_view(aside))
+    onward = joint_motion(pivot, axis, (aside.state - at_rest)[:, 0], "revolute")
+    moved = template.part_poses(aside)
     view_T_part = onward @ rigid(still.rotation[:, 1], still.translation[:, 1])
     assert_close(rigid(moved.rotation[:, 1], moved.translation[:, 1]), view_T_part)
-    turned = roma.rotvec_to_rotmat(leaning.lean[:, 0]) @ template.directions()[0]
-    assert_close(axis, (leaning.rotation @ turned[..., None])[..., 0])
+    turned = roma.rotvec_to_rotmat(aside.deviation[:, 0]) @ template.directions()[0]
+    assert_close(axis, (aside.rotation @ turned[..., None])[..., 0])
 
 
 def test_placements_are_taken_and_joined():
     _, placement = drawn("revolute")
-    back = Placement.cat([placement.take(torch.tensor([2, 3])), placement.take(torch.tensor([0]))])
+    back = cat([take(placement, torch.tensor([2, 3])), take(placement, torch.tensor([0]))])
     assert_close(back.state, placement.state[[2, 3, 0]])
     assert_close(back.shift, placement.shift[[2, 3, 0]])
 
@@ -108,10 +121,37 @@ def test_a_lighter_template_has_the_first_points_and_the_same_joints():
     assert torch.equal(repeated.points[20:40], template.points)
 
 
-def test_a_template_saved_without_leans_has_straight_hinges():
+def test_a_template_saved_without_deviations_has_none():
     template, placement = drawn("revolute")
     saved = {k: v for k, v in template.state_dict().items() if k not in ("rest", "load", "noise")}
     back = ArticulatedTemplate(("revolute",), 20)
     back.load_state_dict(saved)
-    assert not back.leans()
+    assert not back.deviates()
     assert_close(back.place(placement), template.place(placement))
+
+
+@pytest.mark.parametrize("axis", [OUT, UP, torch.tensor([0.6, 0.0, 0.8])])
+def test_across_an_axis(axis: Tensor):
+    frame = torch.stack([axis, *across_axis(axis)])
+    assert_close(frame @ frame.T, torch.eye(3))
+
+
+def test_farthest_features_spread_out():
+    line = torch.arange(11.0)[:, None]
+    assert sorted(spread_out(line, 3).tolist()) == [0, 5, 10]
+
+
+def test_slides_are_marked():
+    shape = ArticulatedTemplate(("revolute", "prismatic"), 5)
+    assert slides(shape).tolist() == [[0.0], [1.0]]
+
+
+def test_a_plate_is_sampled_on_both_faces_and_parts_along_their_border():
+    flat = torch.cat([torch.rand(100, 2, generator=generator(1)), torch.zeros(100, 1)], -1)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(100, 3)
+    part = torch.tensor([1.0, 0.0]).expand(200, 2)
+    points, normals = torch.cat([flat, flat]), torch.cat([up, -up])
+    index = spread_out(surface_features(points, normals, part), 20)
+    assert 5 <= int((index < 100).sum()) <= 15
+    two = surface_features(points[:1].expand(2, 3), normals[:1].expand(2, 3), torch.eye(2))
+    assert (two[0] - two[1]).norm() == pytest.approx(PART_LENGTH * 2**0.5)

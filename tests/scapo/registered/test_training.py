@@ -11,7 +11,7 @@ import torch
 
 from scapo.categories import CATEGORIES
 from scapo.predictor import load
-from scapo.registered.initialisation import DiscoveryConfig
+from scapo.registered.config import DiscoveryConfig
 from scapo.registered.method import RegisteredConfig, RegisteredScapo
 from scapo.store.samples import TrainingData
 from scapo.training import fit
@@ -21,11 +21,16 @@ from tests.helpers.strategies import generator
 from tests.scapo.training.test_fit import InterruptedRunError, same
 
 DISCOVERY = DiscoveryConfig(
-    seeds=14, rotations=200, searched=14, trusted=(0.9,), starts=1, draws=2, heats=(0.8,), judged=4
-)
+    seeds=12, rotations=200, searched=12, trusted=(0.9,), starts=1, draws=2, heats=(0.8,), judged=4,
+    template_points=150, final_points=300,
+)  # fmt: skip
+
+
 CONFIG = RegisteredConfig(
     discovery=DISCOVERY, learned=20, epochs=2, points=128, width=8, batch=8, grid_hypotheses=16
 )
+
+
 RUN = fit.FitConfig(log_every=1, checkpoint_every=0.0, pictures_every=None)
 
 

@@ -7,7 +7,8 @@ import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from scapo.registered.views import free_and_hidden, observe, surface_normals
+from scapo.records import take
+from scapo.registered.views import observe, surface_normals
 from tests.helpers.strategies import generator
 
 
@@ -28,7 +29,7 @@ def test_normals_of_a_sphere_point_outwards():
 def test_free_in_front_hidden_behind_and_free_beside():
     views = observe(plate()[None], torch.tensor([[0.3, -0.2, 2.0]]))
     points = torch.tensor([[[0.0, 0, 0], [0.05, 0, 0.2], [0.05, 0, -0.2], [0.6, 0, 0]]])
-    free, hidden = free_and_hidden(views, points, 0.05)
+    free, hidden = views.free_and_hidden(points, 0.05)
     assert free.tolist() == [[False, True, False, True]]
     assert hidden.tolist() == [[False, False, True, False]]
 
@@ -39,4 +40,4 @@ def test_views_turn_with_the_cloud():
     plain, turned = observe(cloud, camera), observe(cloud @ turn.T, camera @ turn.T)
     assert_close(turned.points, plain.points @ turn.T)
     assert_close(turned.normals, plain.normals @ turn.T, atol=1e-3, rtol=0)
-    assert_close(plain.take(torch.tensor([0])).camera, camera)
+    assert_close(take(plain, torch.tensor([0])).camera, camera)

@@ -57,7 +57,7 @@ def test_adam_continues_as_if_nothing_had_been() -> None:
         step(one, optimizer)
     other, resumed = fresh()
     other.load_state_dict(one.state_dict())
-    checkpoint.load_adam(resumed, checkpoint.adam_arrays(optimizer))
+    checkpoint.load_optimiser(resumed, checkpoint.optimiser_arrays(optimizer), Path("here"))
     step(one, optimizer)
     step(other, resumed)
     assert torch.equal(one.weight, other.weight)

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import FrozenInstanceError, fields, replace
+from dataclasses import MISSING, FrozenInstanceError, fields, replace
 from pathlib import Path
 
 import pytest
 
+from scapo.categories import JointSpec
 from scapo.store.manifest import (
     Instance,
     Manifest,
@@ -17,7 +18,6 @@ from scapo.store.manifest import (
     read_manifest,
     shards_digest,
 )
-from scapo.types import JointSpec
 from tests.helpers.splits import edit_manifest, instance, write_split
 
 
@@ -80,7 +80,7 @@ def test_statistics_may_be_absent(folder: Path) -> None:
     assert read_manifest(folder / "manifest.json").statistics == {}
 
 
-REQUIRED = [field.name for field in fields(Manifest) if field.name != "statistics"]
+REQUIRED = [field.name for field in fields(Manifest) if field.default_factory is MISSING]
 
 
 @pytest.mark.parametrize("name", REQUIRED)
@@ -95,9 +95,26 @@ def test_a_missing_field_is_refused(folder: Path, name: str) -> None:
 def test_a_missing_field_of_a_row_is_refused(folder: Path, rows: str, record: type) -> None:
     data = json.loads((folder / "manifest.json").read_text())
     for field in fields(record):
+        if field.default is not MISSING:
+            continue
         row = {name: value for name, value in data[rows][1].items() if name != field.name}
         edit_manifest(folder, **{rows: [data[rows][0], row, *data[rows][2:]]})
         refuse(folder, f"{rows}[1]: expected field {field.name!r}, found none")
+
+
+def test_trait_and_account_are_kept_and_are_not_written_where_there_are_none(folder: Path) -> None:
+    path = folder / "manifest.json"
+    before = path.read_text()
+    manifest = read_manifest(path)
+    assert {(row.trait, row.account) for row in manifest.instances} == {("", ())}
+    assert manifest.to_json() == before
+    assert "trait" not in before
+    assert "account" not in before
+    told = replace(manifest.instances[0], trait="set back", account=("joint a (door)", "size 1 m"))
+    changed = replace(manifest, instances=(told, *manifest.instances[1:]))
+    path.write_text(changed.to_json())
+    assert read_manifest(path) == changed
+    assert json.loads(path.read_text())["instances"][0]["trait"] == "set back"
 
 
 @pytest.mark.parametrize(

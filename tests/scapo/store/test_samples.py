@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,9 @@ from torch.utils.data import DataLoader, default_collate
 
 from scapo import store
 from scapo.store import samples as data
-from scapo.store.samples import TENSORS, SampleDataset, label, observe
-from scapo.store.schema import LAYOUT, StoreError
+from scapo.store.files import sha256_file
+from scapo.store.samples import OPTIONAL, TENSORS, SampleDataset, label, observe, observed
+from scapo.store.schema import ALIKE, LAYOUT, StoreError
 from tests.helpers.splits import POINTS, edit_manifest, sample_arrays, write_split
 
 COUNTS = (3, 1, 4)
@@ -151,7 +153,8 @@ def test_shards_are_memory_mapped(folder: Path, samples: SampleDataset) -> None:
 
 
 def test_names_choose_the_tensors(folder: Path) -> None:
-    assert set(TENSORS) == set(LAYOUT) - {"color"}
+    assert set(TENSORS) == set(LAYOUT) - {*OPTIONAL, *ALIKE}
+    assert observed(store.open_split(folder)) == TENSORS
     found = store.dataset(folder, names=("points", "part"))[0]
     assert set(found) == {"points", "part", "index"}
     with pytest.raises(StoreError, match=r"00000.safetensors: expected tensor 'color', found none"):
@@ -163,7 +166,9 @@ def test_color_and_tensors_of_ones_own(tmp_path: Path) -> None:
         "color": np.arange(3 * POINTS * 3, dtype=np.uint8).reshape(3, POINTS, 3),
         "weight": np.array([0.5, 0.25, 2.0]),
     }
+    extra["sensor"] = np.arange(9, dtype=np.float32).reshape(3, 3)
     folder = write_split(tmp_path, counts=(3,), change=extra)
+    assert observed(store.open_split(folder)) == (*TENSORS, "color", "sensor")
     samples = store.dataset(folder, names=(*TENSORS, *extra))
     batch = samples.batch(torch.tensor([2, 0]))
     np.testing.assert_array_equal(batch["color"].numpy(), extra["color"][[2, 0]])
@@ -171,6 +176,8 @@ def test_color_and_tensors_of_ones_own(tmp_path: Path) -> None:
     seen = observe(batch)
     assert seen.color is not None
     np.testing.assert_allclose(seen.color.numpy(), extra["color"][[2, 0]] / 255, rtol=1e-6)
+    assert seen.sensor is not None
+    assert seen.sensor.tolist() == [[6.0, 7.0, 8.0], [0.0, 1.0, 2.0]]
 
 
 @pytest.mark.parametrize("name", ["category", "split"])
@@ -200,6 +207,8 @@ def test_a_tensor_of_a_type_that_numpy_lacks_is_refused(folder: Path) -> None:
     tensors = load_file(path)
     header = {"scapo": store.canonical_json(store.read_header(path))}
     save_file({**tensors, "weight": torch.ones(3).bfloat16()}, path, header)
+    shards = json.loads((folder / "manifest.json").read_text())["shards"]
+    edit_manifest(folder, shards=[{**shards[0], "sha256": sha256_file(path)}, *shards[1:]])
     store.dataset(folder)[0]
     with pytest.raises(StoreError, match=r"00000.safetensors: expected numpy-readable tensors"):
         store.dataset(folder, names=("points", "weight"))[0]

@@ -35,6 +35,11 @@ def test_the_layout_is_that_of_the_contract(manifest: Manifest) -> None:
         "visible": "float32",
         "camera": "float32",
         "instance": "int32",
+        "sensor": "float32",
+        "alike": "uint8",
+        "alike_base": "float32",
+        "alike_state": "float32",
+        "alike_part": "uint8",
     }
     assert sample_shapes(manifest, 5) == {
         "points": (5, POINTS, 3),
@@ -47,6 +52,11 @@ def test_the_layout_is_that_of_the_contract(manifest: Manifest) -> None:
         "visible": (5, 3),
         "camera": (5, 6),
         "instance": (5,),
+        "sensor": (5, 3),
+        "alike": (5, 24),
+        "alike_base": (5, 24, 4, 4),
+        "alike_state": (5, 24, 2),
+        "alike_part": (5, 24, 3),
     }
 
 
@@ -91,14 +101,30 @@ IMPOSSIBLE = [
     (put("camera", (3, 5), -1), "'camera', sample 13: expected fx"),
     (put("instance", (2,), 3), "'instance', sample 12: expected an index below 3, found 3"),
     (put("instance", (2,), -1), "'instance', sample 12: expected an index below 3, found -1"),
+    (put("alike", (2, 5), 2), "'alike', sample 12[5]: expected 0 or 1, and 1 for the first turn"),
+    (put("alike", (2, 0), 0), "'alike', sample 12[0]: expected 0 or 1, and 1 for the first turn"),
+    (put("alike_part", (1, 3), [0, 1, 1]), "'alike_part', sample 11[3]: expected every part once"),
+    (put("alike_base", (1, 3), 0), "'alike_base', sample 11[3]: expected a rigid motion"),
+    (put("alike_state", (1, 3, 1), np.nan), "'alike_state', sample 11[3][1]: expected a finite"),
 ]
+
+
+def samples() -> dict[str, np.ndarray]:
+    """Four samples of eyeglasses with the tensors of ambiguity."""
+    arrays = sample_arrays("eyeglasses", 4, 0)
+    return arrays | {
+        "alike": np.tile((np.arange(24) == 0).astype(np.uint8), (4, 1)),
+        "alike_base": np.repeat(arrays["camera_T_part"][:, :1], 24, 1),
+        "alike_state": np.repeat(arrays["joint_state"][:, None], 24, 1),
+        "alike_part": np.tile(np.arange(3, dtype=np.uint8), (4, 24, 1)),
+    }
 
 
 @pytest.mark.parametrize(("change", "message"), IMPOSSIBLE)
 def test_impossible_values_are_refused(
     manifest: Manifest, change: Callable[[dict[str, np.ndarray]], None], message: str
 ) -> None:
-    arrays = sample_arrays("eyeglasses", 4, 0)
+    arrays = samples()
     change(arrays)
     with pytest.raises(StoreError) as caught:
         check_samples(PATH, arrays, manifest, 10, 4)
@@ -108,8 +134,9 @@ def test_impossible_values_are_refused(
 
 @pytest.mark.parametrize("name", LAYOUT)
 def test_other_types_and_shapes_are_refused(manifest: Manifest, name: str) -> None:
-    arrays = sample_arrays("eyeglasses", 4, 0)
+    arrays = samples()
     arrays["color"] = np.zeros((4, POINTS, 3), np.uint8)
+    arrays["sensor"] = np.zeros((4, 3), np.float32)
     good = arrays[name]
     for bad in (good.astype(np.float64), good.astype(np.int64)):
         message = f"tensor '{name}': expected dtype {good.dtype}, found {bad.dtype}"

@@ -20,7 +20,7 @@ from scapo.store.checkpoint import TRAINING, WEIGHTS, read_checkpoint
 from scapo.store.files import read
 from scapo.store.schema import StoreError
 from scapo.training import fit
-from scapo.training.optimiser import cosine
+from scapo.training.optimiser import learning_rate
 from scapo.training.run_folder import TIMING
 from tests.conftest import REPOSITORY
 from tests.helpers.tiny import TINY, tiny, tiny_data
@@ -177,9 +177,9 @@ def test_a_loss_that_is_not_finite_stops_and_saves_the_batch(tmp_path: Path) -> 
 
 def test_the_cosine_goes_from_lr_to_its_minimum() -> None:
     stage = Stage(name="s", epochs=1, lr=1e-3, min_lr=1e-6)
-    assert cosine(stage, 0.0) == pytest.approx(1e-3)
-    assert cosine(stage, 0.5) == pytest.approx((1e-3 + 1e-6) / 2)
-    assert cosine(stage, 1.0) == pytest.approx(1e-6)
+    assert learning_rate(stage, 0.0) == pytest.approx(1e-3)
+    assert learning_rate(stage, 0.5) == pytest.approx((1e-3 + 1e-6) / 2)
+    assert learning_rate(stage, 1.0) == pytest.approx(1e-6)
 
 
 def test_frozen_groups_stay_until_they_begin(tmp_path: Path) -> None:

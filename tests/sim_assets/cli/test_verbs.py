@@ -6,20 +6,29 @@ from __future__ import annotations
 import io
 import json
 import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 from typing import get_args
 
-import numpy as np
 import pytest
 from rich.console import Console
 
 from scapo.categories import CATEGORIES
+from scapo.store import open_split, write_bytes
 from sim_assets.__main__ import main
 from sim_assets.cli import verbs
-from sim_assets.cli.console import RateColumn, progress_bar, watched
-from sim_assets.cli.verbs import VERBS
-from sim_assets.describe.info import describe_state, histogram
+from sim_assets.cli.verbs import VERBS, Benchmark
+from sim_assets.generation import benchmark
+from sim_assets.generation.benchmark import pieces
+from sim_assets.importers import op_align_light
 from sim_assets.inspect.preview import draw_preview
+from tests.helpers import boxes, foreign
+from tests.helpers.foreign import light_set, write_pt
+from tests.helpers.odd_names import NAME
 
 
 def run(*arguments: object) -> int:
@@ -56,7 +65,32 @@ def test_generate_has_the_flags_of_the_contract(capsys):
         image-size sampling color states-per-view workers engine strict"""
     for flag in flags.split():
         assert f"--{flag} " in text, flag
-    assert set(get_args(verbs.Name)) == set(CATEGORIES)
+    assert set(get_args(verbs.CategoryName)) == set(CATEGORIES)
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"scapo-data {metadata.version('scapo')}\n"
+
+
+HEAVY = ("torch", "sapien", "mani_skill", "trimesh", "matplotlib", "scipy", "pandas", "viser")
+"""What takes from a tenth of a second to seconds to import."""
+
+
+def test_help_imports_nothing_heavy():
+    """In a process of its own: of the program, and of every verb."""
+    script = f"""
+import sys, io, contextlib
+from sim_assets.__main__ import main
+for words in {[["--help"], ["--version"], *([verb, "--help"] for verb in VERBS)]!r}:
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        main(words)
+print([name for name in {HEAVY!r} if name in sys.modules])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
 @pytest.mark.parametrize(
@@ -156,21 +190,6 @@ def test_info_tells_counts_ranges_and_damage(data, tmp_path, capsys):
     assert "DAMAGED" in capsys.readouterr().out
 
 
-def test_a_histogram_in_one_line():
-    values = np.concatenate([np.zeros(8), np.ones(4)])
-    line = histogram("name", values, "m")
-    assert line.startswith("  name ")
-    assert "0 █" in line
-    assert "▄ 1 m, mean 0.3333" in line
-    assert "5 deg, mean 5" in histogram("constant", np.full(3, 5.0), "deg")
-
-
-def test_states_in_words():
-    assert describe_state(np.pi / 2, "revolute") == "90°"
-    assert describe_state(0.123, "prismatic") == "12 cm"
-    assert describe_state(float("nan"), "revolute") == "–"
-
-
 def test_preview_draws_a_png(data, tmp_path, capsys):
     out = tmp_path / "sheet.png"
     assert run("preview", data, "--out", out, "--count", 6) == 0
@@ -204,13 +223,120 @@ def test_check_says_of_each_model_what_came_of_it(tmp_path, capsys):
     assert json.loads(results.read_text())["counts"]["refused"] == 1
 
 
-def test_progress_shows_on_a_terminal_only():
-    for terminal in (True, False):
-        stream = io.StringIO()
-        console = Console(file=stream, force_terminal=terminal, width=100)
-        with progress_bar(console) as show:
-            show("samples", 0, 10)
-            show("samples", 10, 10)
-        assert list(watched(console, "assets", "ab", 2)) == ["a", "b"]
-        assert ("10/10" in stream.getvalue()) is terminal
-    assert RateColumn().max_refresh is None
+def test_hostile_names_in_info_and_preview(data, tmp_path, capsys):
+    folder = tmp_path / "split"
+    for path in (data / "laptop/train").iterdir():
+        write_bytes(folder / path.name, path.read_bytes())
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["parts"] = [NAME, "$\\frac{$"]
+    manifest["versions"] = {NAME: NAME}
+    write_bytes(folder / "manifest.json", json.dumps(manifest).encode())
+    usual = run("info", data / "laptop/train"), capsys.readouterr().out.count("\n")
+    assert run("info", folder) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert (0, len(lines)) == usual
+    assert all(line.isprintable() and len(line) < 3000 for line in lines)
+    assert run("preview", folder, "--out", tmp_path / "sheet.png", "--count", 2) == 0
+    assert capsys.readouterr().out.startswith("2 samples drawn")
+
+
+ONLY = ("sensor/scissors/val", "clean/laptop/val")
+
+
+@pytest.fixture
+def console() -> Console:
+    return Console(file=io.StringIO(), width=200)
+
+
+def printed(console: Console) -> str:
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_pieces_are_counted_and_the_record_named(
+    console: Console, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "SIZES", dict.fromkeys(benchmark.SIZES, (1, 2)))
+    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", workers=0)
+    assert verb.run(console) == 0
+    text = printed(console)
+    names = [piece.name for piece in pieces(ONLY)]
+    assert len(names) == 2
+    assert all(f"{number}/2 {name}" in text for number, name in enumerate(names, 1))
+    assert f"recorded in {tmp_path / benchmark.RECORD}" in text
+    assert (tmp_path / benchmark.RECORD).is_file()
+
+
+def test_a_failed_object_ends_in_1_after_all_pieces(
+    console: Console, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "SIZES", dict.fromkeys(benchmark.SIZES, (1, 1)))
+    make = benchmark.make_benchmark
+
+    def failing(*arguments: object) -> Iterator[object]:
+        for done in make(*arguments):  # type: ignore[arg-type]
+            yield replace(done, made=replace(done.made, failed={"scissors-val-2-00000": "died"}))
+
+    monkeypatch.setattr(benchmark, "make_benchmark", failing)
+    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", workers=0)
+    assert verb.run(console) == 1
+    assert "2/2" in printed(console)
+    assert "scissors-val-2-00000" in printed(console)
+
+
+def test_the_command_names_what_it_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    light_set(tmp_path / "set", {"full/laptop_h/train": 3})
+    command = ("import", "op-align-light", tmp_path / "set", "--out", tmp_path / "out")
+    assert run(*command, "--points", 32) == 0
+    assert "3 clouds in 1 splits" in capsys.readouterr().out
+    broken = tmp_path / "set/full/laptop_h/train/100.pt"
+    broken.write_bytes(broken.read_bytes()[:-100])
+    stray = write_pt({}, tmp_path / "set/notes.pt")
+    assert run(*command, "--points", 32) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert (
+        lines[0]
+        == f"left out {stray}: expected a place like {op_align_light.LAYOUT}, found another"
+    )
+    assert lines[1].startswith(f"left out {broken}: expected a whole zip archive, found ")
+    assert lines[2] == f"2 clouds in 1 splits in {tmp_path / 'out'}, 2 left out"
+    manifest = open_split(tmp_path / "out").manifest
+    assert (manifest.count, manifest.statistics) == (2, {"files_refused": 1.0})
+    assert run(*command, "--strict") == 1
+    printed = capsys.readouterr()
+    assert str(stray) in printed.err
+    assert printed.err.count("\n") == 1
+    assert open_split(tmp_path / "out").manifest.count == 2  # untouched
+
+
+def test_models_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    foreign.shape2motion(boxes.laptop(), tmp_path / "set", "laptop")
+    command = ("import", "shape2motion", tmp_path / "set/MDV02/laptop", "--out", tmp_path / "out")
+    assert run(*command) == 0
+    assert capsys.readouterr().out == f"1 models in {tmp_path / 'out'}, 0 left out\n"
+    assert (
+        run(
+            "generate",
+            "laptop",
+            "--source",
+            tmp_path / "out/laptop",
+            "--count",
+            4,
+            "--protocol",
+            "full",
+            "--workers",
+            0,
+            "--out",
+            tmp_path / "data",
+        )
+        == 0
+    )
+    split = open_split(tmp_path / "data")
+    assert split.manifest.instances[0].id == "0001"
+    assert split.manifest.count == 4
+
+
+def test_wrong_usage_of_import(tmp_path: Path):
+    assert run("import", "modelnet", tmp_path, "--out", tmp_path) == 2
+    assert run("import", "hoi4d", tmp_path) == 2
+    assert run("import", "hoi4d", tmp_path / "none", "--out", tmp_path) == 1

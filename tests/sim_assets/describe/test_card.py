@@ -22,7 +22,7 @@ def make(folder: Path, category: str = "eyeglasses", **given) -> Split:
         **{"protocol": "full", "points": 128, "count": 8, "instances": 2, "seed": 3, **given}
     )
     request, assets = make_request(category, options)
-    found = versions(request.settings.backend, request.settings.protocol)
+    found = versions(request.settings.backend)
     generate(request, assets, folder, found, Running(workers=0))
     return Split(folder)
 
@@ -95,9 +95,10 @@ def parsed(command: str) -> tuple[str, DataOptions]:
         {},
         {"protocol": "joint", "backend": "raycast", "color": True, "image_size": 96},
         {"preset": "op-align", "protocol": "full", "states_per_view": 2, "sampling": "fps"},
+        {"protocol": "joint", "backend": "raycast", "ambiguity": True},
         {"protocol": "isolated", "backend": "raycast", "noise": "kinect", "mask": "imperfect"},
     ],
-    ids=["plain", "image", "preset", "noise"],
+    ids=["plain", "image", "preset", "ambiguity", "noise"],
 )
 def test_the_command_makes_the_same_data(given: dict[str, object], tmp_path: Path):
     asked = DataOptions(**{"protocol": "full", "points": 128, "count": 8, "instances": 2, **given})

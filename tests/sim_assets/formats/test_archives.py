@@ -218,3 +218,20 @@ def test_truncated_anywhere(kind: str, tmp_path: Path):
         path.write_bytes(whole[:end])
         with pytest.raises(UnpickleError):
             read_npz(path) if kind == "npz" else read_pt(path)
+
+
+def test_a_tensor_of_more_elements_than_its_storage(tmp_path: Path):
+    """Strides of 0 make gigabytes of a number; a few repeated ones are as torch saves them."""
+    path = tmp_path / "a.pt"
+    row = torch.arange(3.0)
+    write_pt({"x": row.expand(4, 3)}, path)
+    np.testing.assert_array_equal(read_pt(path)["x"], np.tile(np.arange(3), (4, 1)))
+    write_pt({"x": row[:1].expand(1 << 27)}, path)
+    assert path.stat().st_size < 3000
+    with pytest.raises(UnpickleError, match="at most the 3 elements of its storage"):
+        read_pt(path)
+    np.save(tmp_path / "a.npy", np.zeros(3, "S0"))
+    data = (tmp_path / "a.npy").read_bytes().replace(b"(3,)", b"(" + b"9" * 15 + b",)")
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(UnpickleError, match=r"a\.npy: expected a whole \.npy file"):
+        read_npy(tmp_path / "a.npy")

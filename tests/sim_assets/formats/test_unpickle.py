@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_assets.formats.pickled import MAX_DEPTH
+from sim_assets.formats.pickled import MAX_CONTENTS, MAX_DEPTH
 from sim_assets.formats.unpickle import UnpickleError, unpickle
 from tests.helpers.foreign import Calls
 
@@ -183,7 +183,7 @@ BROKEN = {
     "tuple without mark": (b"K\x01t.", "expected a mark"),
     "append to a number": (b"K\x01K\x02a.", "expected list, found int"),
     "odd dict": (b"(K\x01d.", "pairs"),
-    "list as key": (b"}]K\x01s.", "whole pickle"),
+    "list as key": (b"}]K\x01s.", "text as keys, found list"),
     "call of data": (b"K\x01)R.", "expected Admitted, found int"),
     "state of data": (b"K\x01}b.", "expected Buildable, found int"),
     "instance": (b"(ios\nsystem\n.", "opcode INST"),
@@ -216,7 +216,7 @@ def test_deep_and_shared_data():
     with pytest.raises(UnpickleError, match=f"{MAX_DEPTH} levels"):
         unpickle(pickle.dumps(deep), "x")
     laughs: list[Any] = [1]
-    for _ in range(50):  # 2**50 items if each were read where it appears
+    for _ in range(10):
         laughs = [laughs, laughs]
     found = unpickle(pickle.dumps(laughs), "x")
     assert found[0] is found[1]
@@ -294,3 +294,46 @@ def test_damaged_pickles_are_read_or_refused(seed: bytes, data: st.DataObject):
     end = data.draw(st.integers(0, len(damaged)))
     for broken in (bytes(damaged), seed[:end]):
         assert refusal(broken).startswith("x: ")
+
+
+def folded(kind: type[Any]) -> bytes:
+    """A value that holds itself twice, and so on: 2^60 leaves in a few hundred bytes; no STOP."""
+    value: Any = 1
+    for _ in range(60):
+        value = kind([value, value])
+    return pickle.dumps(value, 2)[2:-1]
+
+
+def called(name: bytes) -> bytes:
+    return b"c" + name + folded(tuple) + b"\x85R."
+
+
+FOLDED = {
+    "as a key": b"}" + folded(tuple) + b"Ns.",
+    "in a set": b"\x8f(" + folded(tuple) + b"\x90.",
+    "in a frozen set": b"(" + folded(tuple) + b"\x91.",
+    "in an ordered dict": b"ccollections\nOrderedDict\n](" + folded(tuple) + b"N\x86e\x85R.",
+    "as a persistent id": folded(tuple) + b"Q.",
+    "as a dtype": called(b"numpy\ndtype\n"),
+    "as a class": called(b"numpy._core.multiarray\n_reconstruct\n"),
+    "as text": called(b"_codecs\nencode\n"),
+    "tuples": folded(tuple) + b".",
+    "lists": folded(list) + b".",
+}
+
+
+@pytest.mark.parametrize("name", FOLDED)
+@pytest.mark.timeout(30)
+def test_values_that_hold_one_another_are_counted_unfolded(name: str):
+    """Their hash, their text, or the array made of them would take for ever."""
+    assert len(FOLDED[name]) < 1000
+    with pytest.raises(UnpickleError, match="expected") as caught:
+        unpickle(FOLDED[name], "folded")
+    assert len(str(caught.value)) < 400
+
+
+def test_a_value_in_many_places_may_be_large_once():
+    rows = [list(range(1000))] * 1000
+    assert len(unpickle(pickle.dumps(rows), "rows")) == 1000
+    with pytest.raises(UnpickleError, match=f"at most {MAX_CONTENTS} values"):
+        unpickle(pickle.dumps([rows] * 30), "rows")

@@ -52,8 +52,10 @@ class Trap:
             file.write(f"{self.name}\n")
         loads = self.counter.read_text().split().count(self.name)
         if self.how and loads > self.after:
-            if self.how == "die":
+            if self.how == "die" or (self.how == "die once" and loads == self.after + 1):
                 os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "die once":
+                return laptop(self.name)
             if self.how == "hang":
                 time.sleep(600)
             raise ValueError(f"{self.name}: expected to be good, found {self.how}")
@@ -78,7 +80,7 @@ def test_workers_do_not_change_the_bytes_and_streaming_gives_the_same(tmp_path):
     made: list[Made] = []
     for workers in (0, 2):
         folder = tmp_path / str(workers) / "laptop" / "train"
-        found = versions(request.settings.backend, "joint")
+        found = versions(request.settings.backend)
         made.append(generate(request, assets, folder, found, Running(workers=workers)))
     assert content(made[0].folder) == content(made[1].folder)
     split = open_split(tmp_path / "0", "laptop", "train")
@@ -105,7 +107,7 @@ def check_plan_digest_of_the_other_backend(made: Made, tmp_path: Path) -> None:
     """Ray casting another number of points plans the same objects, states and cameras."""
     options = DataOptions(count=36, instances=4, points=64, image_size=128, backend="raycast")
     request, assets = make_request("laptop", options)
-    other = generate(request, assets, tmp_path / "cast", versions("raycast", "joint"), HERE)
+    other = generate(request, assets, tmp_path / "cast", versions("raycast"), HERE)
     assert other.manifest.plan_digest == made.manifest.plan_digest
     assert other.manifest.digest != made.manifest.digest
 
@@ -187,11 +189,51 @@ def test_objects_that_die_hang_or_fail_cost_themselves_only(tmp_path):
     assert np.unique(split.arrays("instance")["instance"]).tolist() == [0, 4]
     assert {path.name for path in folder.iterdir()} == {
         "card.md",
+        "croissant.json",
         "manifest.json",
         *(shard.file for shard in split.manifest.shards),
     }
     with pytest.raises(GenerateError, match="expected the objects of its manifest"):
         generate(request, [laptop_asset(i) for i in range(6)], folder, VERSIONS, HERE)
+
+
+def test_a_worker_that_is_killed_changes_nothing(tmp_path):
+    """Killed while it describes one object and while it renders another: the same bytes."""
+    whole = generate(plain(20, 4), traps(tmp_path, [""] * 4), tmp_path / "whole", VERSIONS, HERE)
+    (tmp_path / "loads").unlink()
+    assets = traps(tmp_path, ["", "die once", "die once", ""])
+    assets[1] = replace(assets[1], after=0)
+    made = generate(plain(20, 4), assets, tmp_path / "killed", VERSIONS, Running(workers=2))
+    assert made.failed == {}
+    assert content(made.folder) == content(whole.folder)
+    loads = (tmp_path / "loads").read_text().split()
+    assert [loads.count(asset.name) for asset in assets] == [
+        3,
+        4,
+        3,
+        2,
+    ]  # a shard is done again whole
+
+
+def test_what_was_refused_is_said_again_by_every_later_run(tmp_path):
+    """Another object has taken its place, so the data set is whole; it is not silent."""
+    assets = traps(tmp_path, ["", "die", "raise", "", ""], after=0)
+    request = replace(plain(12, 2), instances=3)
+    folder = tmp_path / "split"
+    made = generate(request, assets, folder, VERSIONS, Running(workers=1))
+    refused = {
+        "object1": "its process was ended by SIGKILL",
+        "object2": "object2: expected to be good, found raise",
+    }
+    assert made.failed == refused
+    assert made.manifest.left_out == refused
+    before = content(folder)
+    good = [replace(asset, how="") for asset in assets]
+    for _ in range(2):
+        again = generate(request, good, folder, VERSIONS, HERE)
+        assert again.failed == refused
+        assert again.kept == len(again.manifest.shards)
+        assert content(folder) == before
 
 
 def laptop_asset(index: int) -> ProceduralAsset:
@@ -242,7 +284,7 @@ def test_interrupted_then_killed_then_finished_gives_the_same_bytes(tmp_path, re
     """Ctrl-C after the first shard, kill -9 after the third, then to the end."""
     options = DataOptions(protocol="full", points=512, count=600, instances=30)
     request, assets = make_request("laptop", options)
-    found = versions(request.settings.backend, "full")
+    found = versions(request.settings.backend)
     whole = generate(request, assets, tmp_path / "whole", found, HERE)
     folder = tmp_path / "laptop/train"
     process, errors = stop(tmp_path, repository, 1, signal.SIGINT)

@@ -24,7 +24,7 @@ from scapo.store.schema import StoreError
 from scapo.training import fit
 from scapo.training.distributed import Ranks
 from scapo.training.log import save_batch
-from scapo.training.optimiser import Descent, NotFiniteError, adam
+from scapo.training.optimiser import Descent, NotFiniteError, make_optimiser
 from scapo.training.precision import Arithmetic, scaler
 from scapo.training.run_folder import kept
 from scapo.types import Labels, Observation
@@ -152,7 +152,7 @@ def test_a_gradient_that_is_not_finite_is_told_from_a_loss(tmp_path: Path) -> No
         ranks=Ranks(),
         scaler=scaler("float32", "cpu"),
     )
-    optimizer = adam(method, method.stages()[0])
+    optimizer = make_optimiser(method, method.stages()[0])
     method.requires_grad_(True)
     before = method.map.weight.clone()
 

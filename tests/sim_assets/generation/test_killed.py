@@ -19,7 +19,7 @@ from sim_assets.generation.request import make_request, versions
 out, rounds, rng = Path(sys.argv[1]), int(sys.argv[2]), random.Random(sys.argv[3])
 options = DataOptions(protocol="full", points=512, count=400, instances=20)
 request, assets = make_request("laptop", options)
-found = versions(request.settings.backend, "full")
+found = versions(request.settings.backend)
 started = time.monotonic()
 generate(request, assets, out / "whole", found, Running(workers=0))
 seconds = time.monotonic() - started

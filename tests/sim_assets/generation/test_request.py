@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from sim_assets.generation import shard as shards
+from sim_assets.generation.build import build
 from sim_assets.generation.generate import Running, generate
 from sim_assets.generation.ledger import GenerateError
 from sim_assets.generation.plan import Piece
 from sim_assets.generation.request import make_request
-from sim_assets.generation.shard import shoot_piece
+from sim_assets.generation.shard import render_piece
 from sim_assets.generation.stream import stream
 from sim_assets.options import DataOptions
 
@@ -71,6 +72,34 @@ def test_a_model_that_has_changed_since_the_plan_is_refused():
     other = replace(entry, instance=replace(entry.instance, sha256="f" * 64))
     piece = Piece(entry=other, index=0, first=0, views=1)
     with pytest.raises(ValueError, match="they have changed since this data set was begun"):
-        shoot_piece(request, piece, None, lambda label, amount: None)
-    shots = shoot_piece(request, replace(piece, entry=entry), None, lambda label, amount: None)
-    assert len(shots) == 1
+        render_piece(request, piece, None, lambda label, amount: None)
+    views = render_piece(request, replace(piece, entry=entry), None, lambda label, amount: None)
+    assert len(views) == 1
+
+
+def test_a_complete_sample_needs_the_whole_surface_and_a_renderer():
+    """Its pictures say which views are kept."""
+    with pytest.raises(ValueError, match="protocol: expected full with preset sim-art-complete"):
+        make_request("laptop", DataOptions(preset="sim-art-complete", protocol="joint"))
+    with pytest.raises(ValueError, match="noise and mask: expected none and exact with protocol"):
+        make_request("laptop", DataOptions(preset="sim-art-complete", noise="kinect"))
+    options = DataOptions(preset="sim-art-complete", backend="raycast", count=8, points=64)
+    request, _ = make_request("laptop", options)
+    assert (request.settings.protocol, request.settings.backend) == ("full", "raycast")
+    assert make_request("laptop", FULL)[0].settings.backend is None
+
+
+def test_models_may_be_chosen_by_the_caller(tmp_path):
+    list(build("laptop", count=3, seed=4, out=tmp_path, split="train"))
+    options = DataOptions(source=str(tmp_path), count=4, protocol="full")
+    _, every = make_request("laptop", options)
+    request, assets = make_request("laptop", options, every[1:])
+    assert [asset.name for asset in assets] == [asset.name for asset in every[1:]]
+    assert (request.source, request.instances) == ("urdf", 2)
+
+
+@pytest.mark.parametrize("name", ["up", "any_model"])
+def test_how_models_are_read_is_no_question_of_procedural_objects(name):
+    value = True if name == "any_model" else "z"
+    with pytest.raises(ValueError, match="any_model: expected only with a --source folder"):
+        make_request("laptop", replace(FULL, **{name: value}))

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from scapo.categories import CATEGORIES
-from scapo.store import open_split
-from sim_assets.describe.info import describe_folder
+from scapo.store import Split, open_split
+from sim_assets.describe.info import describe_split, find_splits
 from sim_assets.importers import op_align_real
 from sim_assets.importers.sets import import_set
 from sim_assets.procedural import generate
@@ -43,7 +43,7 @@ PUBLISHED = {
     "eyeglasses": np.diag([1.0, -1, -1]),
     "laptop_h": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
 }
-"""Swap symmetries in the sets' own part frames (PROTOCOL 1.2)."""
+"""Swap symmetries in the sets' own part frames (docs/protocol.md)."""
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -159,7 +159,8 @@ def test_light(name: str, tmp_path: Path):
         assert np.isnan(sample["joint_state"]).all()
     else:
         np.testing.assert_allclose(sample["joint_state"], state, atol=1e-5)
-    (described,) = describe_folder(tmp_path / "out")
+    (folder,) = find_splits(tmp_path / "out")
+    described = describe_split(Split(folder))
     assert described.whole
     assert re.search(r"^  \S.* visible +unknown$", described.text, re.MULTILINE)
     (instance,) = open_split(tmp_path / "out").manifest.instances

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -25,10 +26,10 @@ from sim_assets.generation.assets import ProceduralAsset, RecoverError, recover
 from sim_assets.generation.build import build
 from sim_assets.generation.generate import Running, generate
 from sim_assets.generation.request import make_request, versions
-from sim_assets.inspect import view
-from sim_assets.inspect.view import Shown, Viewer
+from sim_assets.inspect.view import DisplayedSample, Viewer
 from sim_assets.options import DataOptions
 from tests.helpers.browser import open_page
+from tests.helpers.odd_names import PARTS
 
 pytestmark = [
     pytest.mark.skipif(
@@ -42,7 +43,7 @@ def make(folder: Path, category: str, **options) -> Path:
     given = DataOptions(protocol="full", count=6, instances=3, **{"points": 512, **options})
     request, assets = make_request(category, given)
     place = folder / category / "train"
-    generate(request, assets, place, versions(request.settings.backend, "full"), Running(workers=0))
+    generate(request, assets, place, versions(request.settings.backend), Running(workers=0))
     return place
 
 
@@ -82,9 +83,9 @@ def test_splits_samples_and_the_object_of_each(viewer: Viewer):
     state = float(viewer.row["joint_state"][0])
     assert viewer.joint_boxes[0].value == pytest.approx(100 * state, abs=0.006)
     for p, pose in enumerate(thing.pose(np.array([viewer.joint_boxes[0].value / 100]))):
-        assert np.allclose(viewer.stage.parts[p].position, pose[:3, 3])
+        assert np.allclose(viewer.scene.parts[p].position, pose[:3, 3])
     viewer.joint_boxes[0].value = 0.0
-    assert np.allclose(viewer.stage.parts[1].position, 0)
+    assert np.allclose(viewer.scene.parts[1].position, 0)
     viewer.show(5)
     assert viewer.thing is not None
     assert viewer.thing.instance == "drawer-train-1-00002"
@@ -115,11 +116,11 @@ def test_boxes_hide_and_fade(viewer: Viewer):
     viewer.mesh_box.value = False
     viewer.opacity_box.value = 0.8
     viewer.show(1)
-    assert not viewer.stage.cloud[0].visible
-    assert not any(part.visible for part in viewer.stage.parts)
-    assert viewer.stage.axes[0].visible
-    assert not viewer.stage.camera[0].visible
-    assert {mesh.opacity for mesh in viewer.stage.meshes} == {0.8}
+    assert not viewer.scene.cloud[0].visible
+    assert not any(part.visible for part in viewer.scene.parts)
+    assert viewer.scene.axes[0].visible
+    assert not viewer.scene.camera[0].visible
+    assert {mesh.opacity for mesh in viewer.scene.meshes} == {0.8}
 
 
 def test_objects_are_recovered_or_the_reason_is_said(data: Path, tmp_path: Path):
@@ -159,7 +160,7 @@ def test_a_cloud_without_object_or_pose_is_shown(data: Path, tmp_path: Path):
         assert "No mesh: laptop-train-1-00000: expected procedural" in viewer.text.content
         viewer.frame_box.value = "camera"
         viewer.show(1)
-        assert len(viewer.stage.axes) == 1
+        assert len(viewer.scene.axes) == 1
     finally:
         viewer.close()
 
@@ -168,7 +169,7 @@ def test_the_size_of_a_cloud_is_not_that_of_its_stray_points():
     points = np.zeros((1000, 3), np.float32)
     points[:, 0] = np.linspace(0, 1, 1000)
     points[5] = 50
-    shown = Shown(
+    sample = DisplayedSample(
         points=points,
         colors=np.zeros((1000, 3), np.uint8),
         camera_T_object=np.full((4, 4), np.nan),
@@ -176,14 +177,35 @@ def test_the_size_of_a_cloud_is_not_that_of_its_stray_points():
         axis=np.zeros((0, 3)),
         camera=np.zeros(6),
     )
-    assert shown.reach == pytest.approx(0.98, abs=0.002)
-    assert not shown.placed
+    assert sample.reach == pytest.approx(0.98, abs=0.002)
+    assert not sample.placed
 
 
 def near(picture: np.ndarray, color: str) -> int:
     """Pixels of a colour."""
     wanted = np.array(list(bytes.fromhex(color[1:])))
     return int((np.abs(picture.astype(int) - wanted).max(-1) < 12).sum())
+
+
+def test_names_from_files_are_text_in_a_browser(data: Path, tmp_path: Path):
+    for path in (data / "laptop/train").iterdir():
+        write_bytes(tmp_path / "data" / path.name, path.read_bytes())
+    manifest = json.loads((tmp_path / "data/manifest.json").read_text())
+    manifest["parts"] = PARTS
+    manifest["instances"][2]["id"] = odd = "<b onclick=alert()>laptop</b>"
+    write_bytes(tmp_path / "data/manifest.json", json.dumps(manifest).encode())
+    viewer = Viewer(tmp_path / "data", port=free_port())
+    try:
+        assert "<img" not in viewer.legend.content + viewer.text.content
+        with open_page(viewer.url, tmp_path / "profile") as page:
+            wait_for(lambda: all(name in page.text() for name in PARTS))
+            assert f"{PARTS[1]} (deg)" in page.text()
+            viewer.show(5)
+            wait_for(lambda: f"Sample 5 of 6: {odd}" in page.text())
+            assert page.evaluate("document.title") not in ("1", "2", "3", "4")
+            assert page.evaluate("document.querySelectorAll('img[src=x], b').length") == 0
+    finally:
+        viewer.close()
 
 
 @pytest.mark.slow
@@ -233,7 +255,8 @@ def test_what_cannot_be_shown_is_refused(data: Path, tmp_path: Path, monkeypatch
         Viewer(tmp_path)
     with pytest.raises(ValueError, match="port: expected 1 to 65535, found 0"):
         Viewer(data, port=0)
+    with pytest.raises(ValueError, match="host: expected an address of this machine, found '192"):
+        Viewer(data, host="192.0.2.1")
     monkeypatch.setitem(sys.modules, "viser", None)  # as if it were not installed
     with pytest.raises(RuntimeError, match=r"pip install 'scapo\[view\]'"):
         Viewer(data)
-    assert view.MISSING.startswith("view: ")

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import io
+import json
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +20,18 @@ from trimesh.visual.material import PBRMaterial
 from scapo.geometry.camera import Intrinsics
 from sim_assets.models.meshes import GREY
 from sim_assets.models.reader import read
-from sim_assets.models.textures import barycentric, is_readable, look_up, read_texels, texture_of
+from sim_assets.models.textures import (
+    LEFT_OUT,
+    barycentric,
+    is_readable,
+    look_up,
+    read_texels,
+    texture_of,
+)
 from sim_assets.objects import ArticulatedObject
 from sim_assets.rendering.backends import make_renderer, resolve_backend
 from sim_assets.rendering.base import RenderError
-from sim_assets.sampling.cloud import Surface
+from sim_assets.sampling.cloud import SurfaceSamples
 from sim_assets.sampling.viewpoints import generator
 from tests.helpers.urdfs import cabinet
 
@@ -152,7 +162,7 @@ def test_a_sheet_of_two_materials_shows_each_on_its_side(backend, order, tmp_pat
 def test_a_clouds_colours_are_the_textures(tmp_path):
     shown = thing(tmp_path, TEXTURED, png(np.kron(CORNERS, np.ones((16, 16, 1), np.uint8))))
     poses = np.tile(np.eye(4), (2, 1, 1))
-    cloud = Surface(shown, color=True).sample(poses, 4000, 16, generator("texture"))
+    cloud = SurfaceSamples(shown, color=True).sample(poses, 4000, 16, generator("texture"))
     assert cloud.color is not None
     door = shown.part_mesh(1)
     middle = door.bounds.mean(0)
@@ -163,7 +173,7 @@ def test_a_clouds_colours_are_the_textures(tmp_path):
     expected = CORNERS[(points[:, 2] < 0).astype(int), (points[:, 1] < 0).astype(int)]
     assert clear.sum() > 500
     assert np.array_equal(cloud.color[on][clear], expected[clear])
-    assert Surface(shown).sample(poses, 64, 1, generator("plain")).color is None
+    assert SurfaceSamples(shown).sample(poses, 64, 1, generator("plain")).color is None
 
 
 def test_a_texture_that_is_no_picture_is_left_out_and_said_so(tmp_path):
@@ -172,9 +182,80 @@ def test_a_texture_that_is_no_picture_is_left_out_and_said_so(tmp_path):
         assert texture_of(shown.visuals[1][0]) is None
         assert shown.visuals[1][0].color == (1.0, 1.0, 1.0, 1.0)
         said = [line for line in shown.origin.repairs if "texture" in line]
-        assert bool(said) == (name == "cut")  # the loader leaves the other out by itself
+        assert len(said) == 1, name
     absent = thing(tmp_path / "absent", TEXTURED)
     assert texture_of(absent.visuals[1][0]) is None
+    assert absent.origin.repairs == ("A file that a mesh names is not there (picture.png)",)
+
+
+POSTSCRIPT = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 2 2\n%%EndComments\nshowpage\n"
+
+
+def saved(form: str, texels: np.ndarray = CORNERS) -> bytes:
+    data = io.BytesIO()
+    Image.fromarray(texels).save(data, form, **({"lossless": True} if form == "WEBP" else {}))
+    return data.getvalue()
+
+
+@pytest.mark.parametrize("form", ["PNG", "BMP", "TGA", "WEBP", "GIF", "JPEG"])
+def test_pictures_are_told_by_their_content(form, tmp_path):
+    shown = thing(tmp_path, TEXTURED, saved(form))
+    found = texture_of(shown.visuals[1][0])
+    assert found is not None
+    texels = read_texels(found.material)
+    assert texels is not None
+    assert texels.shape == (2, 2, 3)
+    assert shown.origin.repairs == ()
+
+
+@pytest.mark.parametrize("form", ["EPS", "TIFF", "ICO", "PPM"])
+@pytest.mark.parametrize("place", ["obj", "glb"])
+def test_no_other_format_is_decoded(form, place, tmp_path, monkeypatch):
+    """PostScript is a program: Pillow would hand it to Ghostscript when the picture is decoded."""
+
+    def never(*_: object) -> None:
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", never)
+    picture = POSTSCRIPT if form == "EPS" else saved(form)
+    if place == "obj":
+        shown = thing(tmp_path, TEXTURED, picture)
+    else:
+        (tmp_path / "meshes").mkdir(parents=True)
+        (tmp_path / "meshes/door.glb").write_bytes(textured_glb(picture))
+        shown = thing(tmp_path, TEXTURED, None, ("meshes/door.obj", "meshes/door.glb"))
+    assert texture_of(shown.visuals[1][0]) is None
+    where = f"door.{place}"
+    assert shown.origin.repairs == (f"{LEFT_OUT} ({where})",)
+
+
+def textured_glb(picture: bytes) -> bytes:
+    """A sheet whose texture is these bytes, in a material that is converted while it is read."""
+    sheet = trimesh.Trimesh(
+        [[0, 0.2, -0.3], [0, -0.2, -0.3], [0, -0.2, 0.3]], [[0, 1, 2]], process=False
+    )
+    sheet.visual = TextureVisuals(
+        uv=np.zeros((3, 2)), material=PBRMaterial(baseColorTexture=Image.fromarray(CORNERS))
+    )
+    data: Any = trimesh.Scene(sheet).export(file_type="glb")
+    size = int.from_bytes(data[12:16], "little")
+    tree = json.loads(data[20 : 20 + size])
+    buffer = data[28 + size :]
+    tree["images"] = [{"bufferView": len(tree["bufferViews"]), "mimeType": "image/png"}]
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": len(buffer), "byteLength": len(picture)})
+    tree["textures"] = [{"source": 0}]
+    specular = {"diffuseTexture": {"index": 0}}
+    tree["materials"] = [{"extensions": {"KHR_materials_pbrSpecularGlossiness": specular}}]
+    for mesh in tree["meshes"]:
+        mesh["primitives"][0]["material"] = 0
+    buffer += picture
+    tree["buffers"] = [{"byteLength": len(buffer)}]
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    buffer += bytes(-len(buffer) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def test_a_texture_outside_the_models_folder_is_not_read(tmp_path):

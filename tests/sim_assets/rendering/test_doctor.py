@@ -97,9 +97,9 @@ def test_auto_is_the_first_that_works(works: tuple[bool, bool], backend: str | N
 def test_maniskill_is_tried_only_where_it_is_installed(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "probe", renderer)
     monkeypatch.setattr(doctor, "find_spec", lambda name: name)
-    assert doctor._maniskill().works
+    assert doctor._try("maniskill").works
     monkeypatch.setattr(doctor, "find_spec", lambda name: None)
-    found = doctor._maniskill()
+    found = doctor._try("maniskill")
     assert not found.works
     assert "not installed" in found.detail
 
@@ -183,7 +183,10 @@ def test_drivers_named_by_the_environment(monkeypatch: pytest.MonkeyPatch, tmp_p
 
 def test_report_lists_what_is_installed(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(doctor, "probe", renderer)
-    found = doctor.report()
+    lines: list[str] = []
+    found = doctor.report(lines.append)
+    assert lines[0] == "sapien: drawing a picture ..."
+    assert "raycast: works, about raycast" in lines
     versions = {name: version for _, name, version in found.packages}
     assert versions["torch"] == metadata.version("torch")
     assert [item.name for item in found.renderers] == ["sapien", "raycast", "maniskill"]

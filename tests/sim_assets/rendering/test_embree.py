@@ -12,7 +12,7 @@ from sim_assets.objects import Visual
 from sim_assets.procedural import generate
 from sim_assets.rendering import embree as raycast
 from sim_assets.rendering.backends import resolve_backend
-from sim_assets.rendering.base import BACKGROUND, RenderError
+from sim_assets.rendering.base import BACKGROUND, RenderError, pixel_rays
 from sim_assets.rendering.embree import RaycastRenderer
 from sim_assets.sampling.viewpoints import Outline, draw_views, generator
 from tests.helpers.boxes import box, laptop
@@ -95,8 +95,8 @@ def test_the_ray_rectangle_leaves_nothing_out(caster, monkeypatch):
 
     def everywhere(camera, points):
         del points
-        rays = raycast._all_rays(camera)
-        return np.arange(rays[..., 0].size), rays.reshape(-1, 3)
+        rays = pixel_rays(camera)
+        return np.arange(len(rays)), rays
 
     monkeypatch.setattr(raycast, "_rays", everywhere)
     wide = caster.render(view.states[0], view.camera_T_object, CAMERA)

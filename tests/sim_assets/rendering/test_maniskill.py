@@ -17,7 +17,7 @@ from sim_assets.generation.generate import Running, generate
 from sim_assets.generation.request import make_request, versions
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import make_renderer
-from sim_assets.rendering.base import AbstractParallelRenderer, Ask, RenderError
+from sim_assets.rendering.base import AbstractParallelRenderer, RenderError, RenderRequest
 
 pytestmark = [
     pytest.mark.render,
@@ -42,27 +42,29 @@ def many(**given) -> AbstractParallelRenderer:
     return renderer
 
 
-def ask(seed: int, state: list[float], only: int | None = None) -> Ask:
+def request(seed: int, state: list[float], only: int | None = None) -> RenderRequest:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_rotvec(np.random.default_rng(seed).normal(size=3)).as_matrix()
     pose[2, 3] = 0.3
-    return Ask(state=np.array(state), camera_T_object=pose, camera=CAMERA, only=only)
+    return RenderRequest(state=np.array(state), camera_T_object=pose, camera=CAMERA, only=only)
 
 
 @pytest.mark.parametrize("color", [False, True], ids=["plain", "color"])
 def test_pictures_are_those_of_sapien(color: bool):
-    """Different objects, one of them twice, states, cameras; single parts; places that rest."""
+    """Different objects, one of them twice, states, cameras; single parts; sub-scenes that rest."""
     shown = things("eyeglasses", 0, 1, 1)
     rounds = [
-        [ask(1, [0.0, 0.4]), ask(2, [0.5, 1.0]), ask(3, [1.2, 0.1])],
-        [ask(4, [0.2, 0.2], 1), None, ask(5, [0.3, 0.9], 0)],
-        [None, None, ask(6, [0.6, 0.6])],
+        [request(1, [0.0, 0.4]), request(2, [0.5, 1.0]), request(3, [1.2, 0.1])],
+        [request(4, [0.2, 0.2], 1), None, request(5, [0.3, 0.9], 0)],
+        [None, None, request(6, [0.6, 0.6])],
     ]
     with many(color=color) as renderer, make_renderer("sapien", color=color) as alone:
         assert isinstance(renderer, AbstractParallelRenderer)
         renderer.open_all(shown)
-        for asks in rounds:
-            for thing, asked, frame in zip(shown, asks, renderer.render_all(asks), strict=True):
+        for requests in rounds:
+            for thing, asked, frame in zip(
+                shown, requests, renderer.render_all(requests), strict=True
+            ):
                 if asked is None:
                     assert frame is None
                     continue
@@ -87,14 +89,14 @@ def test_what_cannot_be_asked():
     with pytest.raises(RenderError, match="expected one open object, found 0"):
         renderer.render(np.zeros(1), np.eye(4), CAMERA)
     renderer.open_all(things("laptop", 0, 1))
-    with pytest.raises(RenderError, match="expected an ask for each of 2, found 1"):
+    with pytest.raises(RenderError, match="expected a request for each of 2, found 1"):
         renderer.render_all([None])
     assert renderer.render_all([None, None]) == [None, None]
-    other = Ask(
+    other = RenderRequest(
         state=np.zeros(1), camera_T_object=np.eye(4), camera=Intrinsics.from_fov(1.0, 64, 64)
     )
-    with pytest.raises(RenderError, match="same intrinsics in all places, found 2"):
-        renderer.render_all([ask(1, [0.1]), other])
+    with pytest.raises(RenderError, match="same intrinsics in all sub-scenes, found 2"):
+        renderer.render_all([request(1, [0.1]), other])
     renderer.close()
     renderer.close()
 
@@ -109,7 +111,7 @@ def test_samples_are_those_of_sapien(category: str, given: dict, tmp_path: Path)
     for backend in ("sapien", "maniskill"):
         asked = DataOptions(count=24, instances=3, image_size=192, **given, backend=backend)
         request, assets = make_request(category, asked)
-        found = versions(request.settings.backend, request.settings.protocol)
+        found = versions(request.settings.backend)
         generate(request, assets, tmp_path / backend, found, Running(workers=0))
         splits[backend] = Split(tmp_path / backend)
     ours, theirs = splits["maniskill"], splits["sapien"]

@@ -15,7 +15,7 @@ from sim_assets.rendering.embree import RaycastRenderer
 from sim_assets.sampling.cloud import (
     TOLERANCE,
     Cloud,
-    Surface,
+    SurfaceSamples,
     choose,
     choose_far,
     sample_frames,
@@ -115,7 +115,7 @@ def test_visible_share_of_boxes_seen_from_above():
     thing = laptop(width=width, depth=depth, thickness=thickness)
     pose = above(1.0)
     frame = picture(thing, 0.0, pose)
-    surface = Surface(thing)
+    surface = SurfaceSamples(thing)
     shares = surface.visible([frame], CAMERA, truth(thing, np.zeros(1), pose).camera_T_part)
     area = 2 * (width * depth + (width + depth) * thickness)
     top = surface.points[1, :, 2] > thickness - 1e-9
@@ -129,7 +129,9 @@ def test_visible_tells_the_sides_of_a_thin_panel_apart():
     pose = above(1.0)
     assert np.linalg.norm(thing.extents()) * TOLERANCE < 0.002
     frame = picture(thing, 0.0, pose)
-    shares = Surface(thing).visible([frame], CAMERA, truth(thing, np.zeros(1), pose).camera_T_part)
+    shares = SurfaceSamples(thing).visible(
+        [frame], CAMERA, truth(thing, np.zeros(1), pose).camera_T_part
+    )
     assert 0.4 < shares[1] < 0.55
     assert shares[0] == 0
 
@@ -141,7 +143,7 @@ def test_nothing_is_visible_outside_the_picture():
     empty = Frame(depth=np.zeros((256, 256), np.float32), part=np.full((256, 256), 255, np.uint8))
     for pose in (behind, above(0.5)):
         known = truth(thing, np.zeros(1), pose)
-        assert (Surface(thing).visible([empty], CAMERA, known.camera_T_part) == 0).all()
+        assert (SurfaceSamples(thing).visible([empty], CAMERA, known.camera_T_part) == 0).all()
 
 
 def test_surface_samples_are_uniform_by_area_and_on_the_surface():
@@ -168,7 +170,9 @@ def test_the_whole_surface_gives_each_part_its_share_and_at_least_some_points():
     pose = above(0.5)
     for sampling in ("random", "fps"):
         known = truth(tiny, np.zeros(1), pose)
-        cloud = Surface(tiny).sample(known.camera_T_part, 256, 16, generator("full"), sampling)
+        cloud = SurfaceSamples(tiny).sample(
+            known.camera_T_part, 256, 16, generator("full"), sampling
+        )
         assert cloud.points.shape == (256, 3)
         if sampling == "random":
             assert (cloud.part == 1).sum() >= 16

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The published windows number for number (PROTOCOL 2.4, 2.5), and the cameras of CONTRACT 4."""
+"""The published windows number for number (docs/protocol.md), and the benchmark's cameras."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from sim_assets.options import Preset
+from sim_assets.options import PresetName
 from sim_assets.sampling import presets
-from sim_assets.sampling.presets import EAP, OP_ALIGN, PRESETS, ThetaGrid, Thetas
+from sim_assets.sampling.presets import EAP, OP_ALIGN, PRESETS, AngleGrid, AngleSequence
 
-# Degrees at k = 0, 1, 99, worked out from the table of PROTOCOL 2.4.
+# Degrees at k = 0, 1, 99, worked out from the table of docs/protocol.md.
 FULL = {
     "laptop": (-45.0, -44.1, 44.1),  # HOI4D
     "safe": (-45.0, -44.1, 44.1),
@@ -27,8 +27,8 @@ PARTIAL = {
 }
 
 
-def ends(thetas: Thetas | ThetaGrid) -> list[float]:
-    assert isinstance(thetas, Thetas)
+def ends(thetas: AngleSequence | AngleGrid) -> list[float]:
+    assert isinstance(thetas, AngleSequence)
     degrees = thetas.degrees()
     assert len(degrees) == 100
     return [degrees[0], degrees[1], degrees[99]]
@@ -49,7 +49,7 @@ def test_eap_has_the_laptops_of_shape2motion_and_eyeglasses_a_grid():
     for published in (OP_ALIGN, EAP):
         for windows in (published.full, published.partial):
             grid = windows["eyeglasses"]
-            assert isinstance(grid, ThetaGrid)
+            assert isinstance(grid, AngleGrid)
             assert (grid.train, grid.test) == pytest.approx((18 * 0.45, 18 * 0.35))
             assert 9 * grid.train == pytest.approx(72.9)
 
@@ -77,7 +77,7 @@ def test_view_grids():
 
 
 def test_cameras():
-    assert set(PRESETS) == set(get_args(Preset))
+    assert set(PRESETS) == set(get_args(PresetName))
     clean, sensor = presets.camera("sim-art", None), presets.camera("sim-art-sensor", None)
     assert (clean.width, clean.height) == (256, 256)
     assert np.degrees(2 * np.arctan(128 / clean.fy)) == pytest.approx(60)
@@ -93,7 +93,7 @@ def test_cameras():
     assert (small.width, small.height) == (96, 96)
     assert small.fx == pytest.approx(600 * 96 / 480)
     with pytest.raises(ValueError, match=r"preset: expected one of sim-art, .*, found 'other'"):
-        presets.rules("other")
+        presets.find_preset("other")
 
 
 def test_redraw_rule_of_op_align():

@@ -17,12 +17,12 @@ from sim_assets.sensors.depth_camera import FOREIGN_COLOR, Sensor, corrupt, meas
 from sim_assets.sensors.disparity import Disparity
 from sim_assets.sensors.kinect import Kinect
 from sim_assets.sensors.mask import MaskErrors
-from sim_assets.sensors.surface import Edges
+from sim_assets.sensors.surface import EdgeEffects
 from tests.helpers.depth_plates import disc, plate
 
 CAMERA = Intrinsics(fx=600, fy=600, cx=160, cy=120, width=320, height=240)
 EVERY = [(noise, mask) for noise in get_args(Noise) for mask in get_args(Mask)]
-QUIET = Edges(flying=0, lost=0, grazing=None)
+QUIET = EdgeEffects(flying=0, lost=0, grazing=None)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +113,7 @@ def test_flying_pixels_leave_the_surfaces_and_only_at_edges(picture):
     depth, part = picture
     far = np.zeros(2)
     for k, share in enumerate((0.0, 0.5)):
-        model = Sensor(noise="kinect", mask="exact", edges=Edges(flying=share, lost=0))
+        model = Sensor(noise="kinect", mask="exact", edges=EdgeEffects(flying=share, lost=0))
         found, label = corrupt(depth, part, CAMERA, np.random.default_rng(0), model)
         clean = np.where(label == 1, plate(CAMERA, 0.7, 10), plate(CAMERA, 0.8, 30))
         off = (found > 0) & (np.abs(found - clean) > 0.012)

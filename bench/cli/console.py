@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""What the verbs print: lines, tables, progress bars. Names are shown as they are, never obeyed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+    track,
+)
+from rich.table import Table
+from rich.text import Text
+
+from scapo.text import one_line
+
+if TYPE_CHECKING:
+    from scapo.training.fit import Progress as Position
+
+Item = TypeVar("Item")
+
+
+def say(console: Console, line: object) -> None:
+    """One line, however long, without markup and emoji."""
+    console.print(Text(one_line(line)), soft_wrap=True)
+
+
+def watched(console: Console, what: str) -> Callable[[Sequence[Item]], Iterable[Item]]:
+    """Passes items on, with a bar."""
+    return lambda items: track(items, description=what, console=console)
+
+
+@contextmanager
+def stage_bars(console: Console) -> Iterator[Callable[[Position], None]]:
+    """A listener of a training: one bar per stage, none before the first step."""
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>5.1f} %  loss {task.fields[loss]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+    tasks: dict[str, TaskID] = {}
+
+    def show(step: Position) -> None:
+        name = step.stage.name
+        if name not in tasks:
+            progress.start()
+            tasks[name] = progress.add_task(escape(one_line(name, 60)), total=1.0, loss="")
+        loss = "" if step.loss is None else f"{step.loss:.4f}"
+        progress.update(tasks[name], completed=step.done, loss=loss)
+
+    try:
+        yield show
+    finally:
+        if tasks:
+            progress.stop()
+
+
+def summary_table(report: dict[str, Any]) -> Table:
+    """Means, intervals and undefined values of an evaluation."""
+    names = f"{report['method']} {report['category']} {report['split']}"
+    table = _table(f"{names}, {report['counts']['samples']} samples")
+    for heading in ("metric", "mean", "95 % interval", "undefined"):
+        table.add_column(heading, justify="left" if heading == "metric" else "right")
+    for name, row in report["summary"].items():
+        metric, unit = name.rsplit("_", 1)
+        known = row["mean"] is not None
+        table.add_row(
+            f"{metric}, {unit}" if unit != "1" else metric,
+            f"{row['mean']:.4g}" if known else "–",
+            f"{row['low']:.4g} to {row['high']:.4g}" if known else "–",
+            str(row["undefined"]),
+        )
+    return table
+
+
+TITLES = {"none": "not moved", "rotation": "turned", "translation": "shifted", "both": "both"}
+
+
+def stability_tables(report: dict[str, Any]) -> Iterator[Table]:
+    """Per mode: changes under motion, a column per kind, and scatter over resamplings."""
+    about = f"{report['method']} {report['category']} {report['data']['split']}"
+    count = len(report["data"]["samples"])
+    for mode, found in report["modes"].items():
+        rate = f"{found['clouds_per_second']:.3g} a second"
+        moved = found["equivariance"]
+        table = _table(f"{about}, {mode}, {count} clouds, {rate}")
+        for heading in ("change, median / p95", *(TITLES[kind] for kind in moved)):
+            table.add_column(heading)
+        for name in moved["both"]:
+            table.add_row(quantity(name), *(_pair(rows[name]) for rows in moved.values()))
+        yield table
+        if "resampling" in found:
+            yield _scatter_table(found["resampling"])
+
+
+def _scatter_table(rows: dict[str, Any]) -> Table:
+    table = Table("scatter", "std, median", "MAD, median", "MAD, p95", title="resampled")
+    for name in dict.fromkeys(key.rsplit("_", 1)[0] for key in rows):
+        std, mad = rows[f"{name}_std"], rows[f"{name}_mad"]
+        table.add_row(quantity(name), _ranged(std, "median"), _ranged(mad, "median"),
+                      _ranged(mad, "p95"))  # fmt: skip
+    return table
+
+
+def quantity(name: str) -> str:
+    """`base_rotation_deg` as a reader takes it: base rotation, deg."""
+    head, unit = name.replace("_", " ").rsplit(" ", 1)
+    return head if unit == "1" else f"{head}, {unit}"
+
+
+def _table(title: str) -> Table:
+    return Table(title=Text(one_line(title, 200)))
+
+
+def _number(value: float) -> str:
+    return "<1e-3" if 0 < value < 1e-3 else f"{value:.3g}"
+
+
+def _pair(row: dict[str, Any]) -> str:
+    if "median" not in row:
+        return "–"
+    return f"{_number(row['median']['value'])} / {_number(row['p95']['value'])}"
+
+
+def _ranged(row: dict[str, Any], key: str) -> str:
+    if key not in row:
+        return "–"
+    low, high = _number(row[key]["low"]), _number(row[key]["high"])
+    return f"{_number(row[key]['value'])} ({low} to {high})"

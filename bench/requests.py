@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""What each job of the bench is asked: dataclasses whose fields are the flags of its verb.
+
+Light to import, so that the command line can show its help without the networks; the plain
+function of each job (`bench.runs.predict.predict`, `bench.scoring.evaluate.evaluate`, ...) takes
+one of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Generic, Literal, TypeVar
+
+import tyro
+
+from bench.matching import LabelOrder
+from bench.metrics import ApRule, IouKind, PivotKind, RotationKind
+
+Mode = Literal["fast", "refine"]
+"""`scapo.method.Mode`, written out: that module loads torch."""
+Precision = Literal["float32", "bfloat16", "float16"]
+"""`scapo.training.precision.Precision`, likewise."""
+Geometry = Literal["se3", "opalign-compat"]
+Ambiguity = Literal["off", "on"]
+Kind = Literal["constant", "oracle-pose"]
+"""The answers of `reference`."""
+
+M = TypeVar("M")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """The readings of the metrics (docs/protocol.md); the defaults are the benchmark's."""
+
+    geometry: Geometry = "se3"
+    """Rigid geometry, or OP-Align's released evaluator on `record_*` tensors."""
+    ap_rule: ApRule = "mean"
+    """How the parts of a sample join in the average precision."""
+    pivot: PivotKind = "point-line"
+    """Distance of the predicted pivot to the true axis, or between the two axes."""
+    label_order: LabelOrder = "sample"
+    """Part order chosen per sample, once per data set, or by Hungarian matching per sample."""
+    iou: IouKind = "hard"
+    """Intersection over union of labels, or of weights."""
+    rotation: RotationKind = "full"
+    """Rotation errors up to 180 degrees, or folded to 90."""
+    ambiguity: Ambiguity = "off"
+    """Score against the truth, or against the best of the turns that look alike where the data say
+    so (docs/ambiguity.md)."""
+
+    def changes(self) -> str:
+        """What differs from the defaults and changes per-sample scores, for the variant's name."""
+        names = ("geometry", "pivot", "label_order", "iou", "rotation", "ambiguity")
+        default = Settings()
+        changed = [n for n in names if getattr(self, n) != getattr(default, n)]
+        return ",".join(f"{n.replace('_', '-')}={getattr(self, n)}" for n in changed)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What to score, how, and where the results go."""
+
+    predictions: Path
+    """Predictions (safetensors, docs/bring-your-own-method.md)."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    out: Path
+    """Where the results go."""
+    split: str = "test"
+    """Split that was predicted."""
+    calibration: Path | None = None
+    """Predictions of the same run on the training split, to fit the frames of a method that saw
+    no poses. Without it poses are compared as given."""
+    settings: tyro.conf.Suppress[tyro.conf.Fixed[Settings]] = field(default_factory=Settings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunRequest:
+    """A trained method and the data it is shown."""
+
+    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, or a checkpoint file."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictRequest(RunRequest):
+    """What to predict, and how."""
+
+    out: Path
+    """Predictions file, NAME.safetensors."""
+    split: str = "test"
+    """Split to predict."""
+    mode: Mode = "fast"
+    """fast: networks only; refine: with optimisation at test time."""
+    oracle: bool = False
+    """Show a method that can use them true labels of the test split (icp: the parts); the
+    variant then begins with oracle."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+    batch: int = 32
+    """Clouds at a time."""
+    limit: int | None = None
+    """Predict so many clouds alone, evenly spread over the split (500 are enough to calibrate);
+    the others have no answer in the file."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StabilityRequest(RunRequest):
+    """How much of a method's stability is measured."""
+
+    out: Path
+    """Report, FILE.json."""
+    split: str = "test"
+    """Split whose clouds are used, without labels."""
+    mode: Literal["fast", "refine", "both"] = "both"
+    """Inference modes to measure."""
+    samples: int = 20
+    """Clouds, evenly spread over the split."""
+    motions: int = 2
+    """Random motions of each kind for each cloud."""
+    resamplings: int = 20
+    """Random subsets of each cloud; 0 for none."""
+    points: int | None = None
+    """Points of a subset; by default half of the clouds' own, at most 1,024. Data generated with
+    --points 4096 have new points to draw, where halves of 1,024 share theirs."""
+    seed: int = 0
+    """Seed of the motions and subsets."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+    batch: int = 32
+    """Clouds at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PicturesRequest(RunRequest):
+    """What is drawn of a run."""
+
+    predictions: Path
+    """Predictions of that run (safetensors)."""
+    out: Path
+    """Folder for overlay.png, template.png, ranking.png and training.png."""
+    split: str = "test"
+    """Split that was predicted."""
+    calibration: Path | None = None
+    """Predictions of the same run on the training split, as for evaluate: they put a method that
+    saw no poses into the true frame, so that its figures are upright."""
+    clouds: int = 24
+    """Clouds in overlay.png, evenly spread over the split."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyRequest:
+    """Which runs are studied, and on what."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    """Run folders, of any methods and categories."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    out: Path
+    """Folder for predictions/, scores/, ladders/, pictures/, stability/ and README.md."""
+    split: str = "test"
+    """Split to score."""
+    mode: Literal["fast", "refine", "both"] = "both"
+    """Inference modes to study."""
+    calibration: int = 500
+    """Training clouds that fix the frames of a method that saw no poses."""
+    samples: int = 20
+    """Clouds for stability; 0 leaves it out."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainRequest(Generic[M]):
+    """Which method is fitted to what, and how."""
+
+    method: Annotated[M, tyro.conf.arg(name="")]
+    category: str
+    """Category of the data."""
+    data: Path
+    """Data set: the folder above CATEGORY/train, or above that of a benchmark."""
+    out: Path
+    """Run folder."""
+    split: str = "train"
+    """Split to train on."""
+    val_split: str = "val"
+    """Split for methods with a validation pass; without it, every tenth object of --split."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, cuda:1, ..."""
+    seed: int = 1
+    """Seed of the first weights, the order of the data and the augmentation."""
+    resume: bool = False
+    """Continue the run in that folder, or begin it where there is none."""
+    log_every: int = 10
+    """Steps between two lines of metrics.jsonl."""
+    checkpoint_every: float = 60.0
+    """Seconds after which the end of an epoch saves the state."""
+    precision: Precision = "float32"
+    """Number type of the networks' matrix products; geometry and losses stay float32."""
+    compile: bool = False
+    """Compile the networks, on CUDA with CUDA graphs."""
+    tf32: bool = True
+    """On CUDA, float32 matrix products of networks with 10-bit mantissas."""
+    pictures_every: float = 300.0
+    """Seconds after which the end of an epoch draws pictures, as does the end of a stage."""
+    pictures: bool = True
+    """Draw pictures at all."""

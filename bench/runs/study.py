@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""`study`: everything that is to be known of trained runs, and one page of it.
+
+For each run and inference mode: predictions on the training split (some, for the frames) and on
+the split to be scored, scores, the oracle ladder, pictures; for each run its stability. What is
+there and newer than its run stays, so a study that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from bench.analysis.study_page import Entry, write_page
+from bench.figures.explain import explain
+from bench.figures.run import draw_pictures
+from bench.methods import load
+from bench.requests import (
+    Mode,
+    PicturesRequest,
+    PredictRequest,
+    Request,
+    StabilityRequest,
+    StudyRequest,
+)
+from bench.runs.predict import Watch, predict
+from bench.runs.stability import measure_stability
+from bench.scoring.evaluate import evaluate
+from scapo.store import StoreError
+from scapo.store.checkpoint import WEIGHTS
+
+LONGEST_NAME = 150
+"""Characters of a run's name in names of files, which may have 255 bytes."""
+
+
+def study(request: StudyRequest, say: Callable[[str], None], watch: Watch = iter) -> Path:
+    """Do what is missing, then write the page anew.
+
+    Args:
+        request: Which runs, on what.
+        say: Told of each file before it is made.
+        watch: Passes the batches of a prediction on.
+
+    Returns:
+        The page.
+
+    Raises:
+        StoreError: No such run or data, or two runs of one name.
+    """
+    modes: tuple[Mode, ...] = ("fast", "refine") if request.mode == "both" else (request.mode,)
+    work = _Study(request, say, watch)
+    entries: list[Entry] = []
+    for run in request.runs:
+        name, calibrated = _name(run)
+        if any(entry.name.rpartition("-")[0] == name for entry in entries):
+            raise StoreError(f"{run}: expected runs of different names, found {name!r} twice")
+        entries += [work.mode(run, f"{name}-{mode}", mode, calibrated) for mode in modes]
+        if request.samples:
+            work.stability(run, name)
+    return write_page(request.out, entries, command(request))
+
+
+def command(request: StudyRequest) -> str:
+    """As it was typed, without the folders of this machine."""
+    words = ["scapo-bench study", *(_shown(run) for run in request.runs), "--data",
+             _shown(request.data), "--out", _shown(request.out), "--split", request.split,
+             "--mode", request.mode, "--calibration", str(request.calibration),
+             "--samples", str(request.samples)]  # fmt: skip
+    return " ".join(words)
+
+
+def _shown(path: Path) -> str:
+    return path.name if path.is_absolute() else str(path)
+
+
+def _name(run: Path) -> tuple[str, bool]:
+    """A run's name in files, and whether its frames must be fitted."""
+    method, header = load(run)
+    words = [header["category"], method.name, method.variant, f"seed{header['seed']}"]
+    name = "-".join(re.sub(r"[^\w.,=+@-]", "_", word) for word in words if word)
+    return name[:LONGEST_NAME], "pose" not in method.supervision
+
+
+def _weights(run: Path) -> Path:
+    return run / WEIGHTS if run.is_dir() else run
+
+
+class _Study:
+    """The files of one study."""
+
+    def __init__(self, request: StudyRequest, say: Callable[[str], None], watch: Watch) -> None:
+        self.request, self.say, self.watch = request, say, watch
+
+    def mode(self, run: Path, name: str, mode: Mode, calibrated: bool) -> Entry:
+        """Predictions, scores, ladder and pictures of one run in one mode."""
+        data, split, out = self.request.data, self.request.split, self.request.out
+        scored = out / "predictions" / f"{name}-{split}.safetensors"
+        trained = out / "predictions" / f"{name}-train.safetensors"
+        self._predict(run, scored, mode, None)
+        if calibrated:
+            self._predict(run, trained, mode, self.request.calibration)
+        inputs = (scored, trained) if calibrated else (scored,)
+        frames = trained if calibrated else None
+        scores = out / "scores" / f"{name}.csv.gz"
+        ladder, pictures = out / "ladders" / name, out / "pictures" / name
+
+        def asked(out: Path) -> Request:
+            return Request(predictions=scored, data=data, out=out, split=split,
+                           calibration=frames)  # fmt: skip
+
+        drawn = PicturesRequest(checkpoint=run, data=data, predictions=scored, out=pictures,
+                                split=split, calibration=frames)  # fmt: skip
+        self._made(scores, inputs, lambda: evaluate(asked(scores)))
+        self._made(ladder / "ladder.md", inputs, lambda: explain(asked(ladder)))
+        self._made(pictures / "ranking.png", inputs, lambda: list(draw_pictures(drawn)))
+        return Entry(name=name, mode=mode, scores=scores, ladder=ladder / "ladder.md",
+                     pictures=pictures)  # fmt: skip
+
+    def stability(self, run: Path, name: str) -> None:
+        """The stability report of a run."""
+        asked = self.request
+        out = asked.out / "stability" / f"{name}.json"
+        request = StabilityRequest(
+            checkpoint=_weights(run), data=asked.data, out=out, split=asked.split,
+            mode=asked.mode, samples=asked.samples, device=asked.device,
+        )  # fmt: skip
+        self._made(out, (request.checkpoint,), lambda: measure_stability(request))
+
+    def _predict(self, run: Path, out: Path, mode: Mode, limit: int | None) -> None:
+        asked = self.request
+        request = PredictRequest(
+            checkpoint=_weights(run), data=asked.data, out=out, mode=mode, limit=limit,
+            split=asked.split if limit is None else "train", device=asked.device,
+        )  # fmt: skip
+        self._made(out, (request.checkpoint,), lambda: predict(request, self.watch))
+
+    def _made(self, out: Path, inputs: tuple[Path, ...], make: Callable[[], object]) -> None:
+        """Make a file unless it is newer than all its inputs."""
+        if out.is_file() and all(out.stat().st_mtime >= path.stat().st_mtime for path in inputs):
+            return
+        self.say(f"study: {out}")
+        make()

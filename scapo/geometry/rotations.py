@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""Rotations by roma, which is imported at the first call: it loads the compiler, over a second.
+
+Vectors are axis times angle in radians; matrices act on columns; quaternions are xyzw.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
+    """The rotation by the vector's length about its direction."""
+    import roma
+
+    return roma.rotvec_to_rotmat(vector)
+
+
+def rotmat_to_rotvec(rotation: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3"]:
+    """Its inverse, of at most half a turn."""
+    import roma
+
+    return roma.rotmat_to_rotvec(rotation)
+
+
+def unitquat_to_rotmat(quaternion: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3 3"]:
+    """The rotation of a unit quaternion."""
+    import roma
+
+    return roma.unitquat_to_rotmat(quaternion)
+
+
+def special_procrustes(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
+    """The rotation nearest to a matrix."""
+    import roma
+
+    return cast("Tensor", roma.special_procrustes(matrix))

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: MIT
+"""What can be chosen of the search for a category's template (`discovery`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from scapo.registered.joint_limits import RANGE_COST
+
+LEAST_ROTATIONS = 200
+"""Of a grid: with fewer, registration would have no choice of those that it scores twice."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoveryConfig:
+    """How the template is found, and how much is tried; times are of one CPU core."""
+
+    seeds: int = 72
+    """Views registered with one another in each draw, 10 ms a pair."""
+    agreeing: float = 0.4
+    """Share of the registered views, the most confident, that the first fit uses."""
+    rotations: int = 1000
+    """Rotations of the grid that registration and search try, at least 200."""
+    searched: int = 144
+    """Views that the rounds of search and fit use, 0.2 s each and round."""
+    trusted: tuple[float, ...] = (0.55, 0.7, 0.85)
+    """Share of the searched views, the most confident, that each round keeps as inliers; the first
+    round is on half of the views where mirror images are tried."""
+    starts: int = 3
+    """Proposed axes of each joint that are fitted; two of each where joints are several."""
+    draws: int = 3
+    """Draws of views to register: how many of their poses agree is a matter of luck."""
+    contenders: int = 2
+    """First templates of each draw, those of least loss, that held-out views judge."""
+    finalists: int = 3
+    """First templates that enter the rungs, those that explain the held-out views best."""
+    heats: tuple[float, ...] = (0.4, 0.55)
+    """Share of inliers in each rung of these, on half of the views; then the best goes on alone."""
+    judged: int = 48
+    """Views held out to judge templates, at most a quarter of all."""
+    range_cost: float = RANGE_COST
+    """Mean loss that a radian of a joint's range must save; 0: any joint limits."""
+    axis_weight: float = 1.0
+    """Pull of the axes to the main directions of the base once a template is chosen (before, wrong
+    axes must be free to turn) and where the base has two of them; 0: none."""
+    held_frame: bool = True
+    """Turn the template's frame to the main directions of its base in every round."""
+    way_out: bool = True
+    """Take the way out of the body for a sliding joint's axis."""
+    mirror: bool = True
+    """Try whether the base lacks a side that is the mirror image of another."""
+    leans: bool = True
+    """Try whether the axes of hinges deviate from one object to the next."""
+    template_points: int = 400
+    """Points of the template while it is sought."""
+    final_points: int = 1600
+    """Points of the template that is found; its parts end as sharply as it is dense."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a grid too coarse to rank its rotations."""
+        if self.rotations < LEAST_ROTATIONS:
+            raise ValueError(
+                f"rotations: expected at least {LEAST_ROTATIONS}, found {self.rotations}"
+            )

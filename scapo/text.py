@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""Names and messages that came from outside, made fit for a terminal, a table or a spreadsheet.
+
+What a file says of itself may hold line breaks, escape sequences, markup or a megabyte of text.
+"""
+
+from __future__ import annotations
+
+import re
+
+LONGEST = 2000
+"""Characters of a message; of longer text the middle is left out."""
+_FORMULA = re.compile(r"'*[=+\-@\t\r]")
+"""What a spreadsheet would compute, after any number of the quotes that prevent it."""
+
+
+def one_line(text: object, longest: int = LONGEST) -> str:
+    r"""Text on one line, without what a terminal would obey, at most `longest` characters.
+
+    >>> one_line("a\nb \x1b[31mred\x9b2J")
+    'a b \\x1b[31mred\\x9b2J'
+    >>> one_line("x" * 50, 20)
+    'xxxxxxxxxxx … xxxxxx'
+    """
+    line = _shortened(str(text), longest)
+    line = " ".join(part.strip() for part in line.splitlines() if part.strip())
+    if line.isprintable():
+        return line
+    shown = (c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return _shortened("".join(shown), longest)
+
+
+def _shortened(text: str, longest: int) -> str:
+    if len(text) <= longest:
+        return text
+    tail = longest // 3
+    return f"{text[: longest - tail - 3]} … {text[len(text) - tail :]}"
+
+
+def as_cell(text: str) -> str:
+    """A text cell of a CSV file that no spreadsheet takes for a formula; `from_cell` undoes it.
+
+    >>> as_cell("=1+1"), as_cell("scapo"), from_cell(as_cell("'-x"))
+    ("'=1+1", 'scapo', "'-x")
+    """
+    return f"'{text}" if _FORMULA.match(text) else text
+
+
+def from_cell(cell: str) -> str:
+    """The text of a cell that `as_cell` wrote."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
+def as_markdown(text: str) -> str:
+    r"""Text of a Markdown table or list, without HTML, links and column marks of its own.
+
+    >>> as_markdown("a|b <img src=x> [c](d) R&D")
+    'a\\|b &lt;img src=x&gt; [c]\\(d) R&amp;D'
+    """
+    line = one_line(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return line.replace("|", "\\|").replace("](", "]\\(")

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: MIT
+"""Damaged files of every format, the same each time; `make fuzz` tries others for an hour."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.formats import FORMATS
+from tests.fuzz.play import Game
+
+LENIENT = ("made marker", "MTL", "PNG", "finished", "semantics.txt", "mobility_v2.json")
+"""What is wrong in these is left out, and said, or answered with no."""
+FOUND: dict[str, tuple[int, ...]] = {}
+"""Cases of long runs that once failed."""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path):
+    game = Game(name, tmp_path / "game")
+    verdicts: Counter[str] = Counter()
+    bad = {}
+    for number in (*range(FORMATS[name].cases), *FOUND.get(name, ())):
+        finding = game.play(number)
+        verdicts[finding.verdict] += 1
+        if finding.verdict not in ("read", "refused"):
+            bad[number] = (finding.verdict, finding.words[:300])
+    assert not bad
+    assert verdicts["refused"] or name in (
+        "made marker",
+        "MTL",
+        "PNG",
+        "finished",
+        "semantics.txt",
+        "mobility_v2.json",
+    )

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Each method of the bench as a training of seconds; one that is not named here trains as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tests.helpers.hinged import plates
+from tests.helpers.splits import write_split
+
+FLAGS: dict[str, list[str]] = {
+    "scapo": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--encoder.centres", "16", "--encoder.neighbours", "6", "--encoder.width", "6",
+        "--decoder.points", "64", "--decoder.widths", "16", "16", "8",
+    ],
+    "registered": [
+        "--learned", "8", "--epochs", "1", "--points", "128", "--width", "8",
+        "--grid-hypotheses", "4",
+        "--discovery.seeds", "8", "--discovery.searched", "8", "--discovery.rotations", "200",
+        "--discovery.starts", "1", "--discovery.draws", "1", "--discovery.judged", "2",
+        "--discovery.finalists", "1", "--discovery.trusted", "0.9", "--discovery.heats", "0.8",
+        "--discovery.no-mirror", "--discovery.no-leans",
+        "--discovery.template-points", "60", "--discovery.final-points", "80",
+    ],
+    "icp": ["--templates", "2"],
+}  # fmt: skip
+
+
+POINTS = 160
+"""Of each cloud."""
+
+
+def hinged_data(folder: Path, *, train: int = 12, test: int = 5, color: bool = False) -> Path:
+    """A train and a test split of two plates that turn, as laptops; colours come with sensors."""
+    for split, count in (("train", train), ("test", test)):
+        observation, labels = plates(count, POINTS, seed=count)
+        assert labels.camera_T_part is not None
+        assert labels.joints is not None
+        assert labels.part is not None
+        change = {
+            "points": observation.points.numpy(),
+            "part": labels.part.numpy().astype(np.uint8),
+            "camera_T_part": labels.camera_T_part.numpy(),
+            "joint_pivot": labels.joints.pivot.numpy(),
+            "joint_axis": labels.joints.axis.numpy(),
+            "joint_state": labels.joints.state.numpy(),
+        }
+        if color:
+            shades = np.random.default_rng(0).integers(0, 256, observation.points.shape)
+            shades[..., 2] = 255 * change["part"]  # blue tells the parts
+            change["color"] = shades.astype(np.uint8)
+            change["sensor"] = np.zeros((count, 3), np.float32)
+        write_split(
+            folder / "laptop" / split, split=split, counts=(count,), change=change, points=POINTS
+        )
+    return folder

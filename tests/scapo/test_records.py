@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Records are changed, picked and joined tensor by tensor, as if written out by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from scapo.records import cat, map_tensors, take
+from scapo.types import Joints, Labels, Observation, Prediction
+
+
+def labels(first: int, count: int) -> Labels:
+    number = torch.arange(first, first + count, dtype=torch.float32)
+    line = number[:, None, None].expand(count, 2, 3)
+    joints = Joints(pivot=line + 0.5, axis=line, state=number[:, None].expand(count, 2))
+    return Labels(part=torch.arange(count * 4).view(count, 4) + first, joints=joints)
+
+
+def test_nested_records_are_followed_and_what_is_withheld_stays_so() -> None:
+    changed = map_tensors(labels(0, 3), lambda tensor: tensor * 2)
+    assert changed.joints is not None
+    assert changed.part is not None
+    assert torch.equal(changed.part, torch.arange(12).view(3, 4) * 2)
+    assert torch.equal(changed.joints.pivot[2], torch.full((2, 3), 5.0))
+    assert changed.camera_T_part is None
+    assert map_tensors(Labels(), lambda tensor: tensor + 1) == Labels()
+
+
+def test_mappings_and_tuples_are_followed() -> None:
+    weight = torch.ones(2, 5, 3)
+    prediction = Prediction(part_weight=weight, record={"S": torch.zeros(2, 1)})
+    changed = map_tensors((prediction, "word", 3), lambda tensor: tensor - 1)
+    assert changed[1:] == ("word", 3)
+    assert torch.equal(changed[0].part_weight, weight * 0)
+    assert changed[0].record is not None
+    assert torch.equal(changed[0].record["S"], -torch.ones(2, 1))
+
+
+def test_take_and_cat_are_inverse() -> None:
+    whole = labels(0, 5)
+    again = cat([take(whole, torch.tensor([0, 1])), take(whole, torch.tensor([2, 3, 4]))])
+    assert whole.joints is not None
+    assert again.joints is not None
+    assert torch.equal(again.joints.state, whole.joints.state)
+    assert again.part is not None
+    assert whole.part is not None
+    assert torch.equal(again.part, whole.part)
+    some = take(whole, torch.tensor([True, False, False, False, True]))
+    assert some.part is not None
+    assert some.part[:, 0].tolist() == [0, 16]
+
+
+def test_records_that_do_not_fit_are_not_joined() -> None:
+    points = torch.zeros(1, 2, 3)
+    with pytest.raises(ValueError, match="expected the same fields in all, found NoneType and Ten"):
+        cat([Observation(points=points), Observation(points=points, color=points)])
+    with pytest.raises(ValueError, match="expected one or more to join, found none"):
+        cat([])
