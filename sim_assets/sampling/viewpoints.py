@@ -44,7 +44,7 @@ JITTER = 0.05
 """Largest offset of the box's centre from the image's centre, as a share of the image's side."""
 OUTLINE_DIRECTIONS = 400
 """In which the outermost points of each part are kept."""
-STEPS = 6
+STEPS = 12
 """Of the fixed-point iteration that frames the object; 1e-3 of the image is left at most."""
 PUBLISHED_T_OBJECT = np.diag([-1.0, -1.0, 1.0])
 """From our object frame (front -x) to the one taken for theirs (front +x)."""
