@@ -33,6 +33,6 @@ def read_regular(path: Path, limit: int = MAX_BYTES) -> bytes:
             words = f"{found.st_size} bytes, more than {limit}"
             raise OSError(errno.EFBIG, words, str(path))
         with os.fdopen(handle, "rb", closefd=False) as file:
-            return file.read(limit)
+            return file.read(found.st_size)  # not of the limit: so much would be set aside first
     finally:
         os.close(handle)

@@ -13,14 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
-from scapo import types
+from scapo import categories, types
 from scapo.types import Joints, Labels, Observation, Prediction, Sample, SampleKey, Supervision
 from tests.helpers.strategies import batch_shapes, joints, normal, rigid_motions, seeds
 
 RECORDS = [
     value
-    for value in vars(types).values()
-    if isinstance(value, type) and is_dataclass(value) and value.__module__ == types.__name__
+    for module in (types, categories)
+    for value in vars(module).values()
+    if isinstance(value, type) and is_dataclass(value) and value.__module__ == module.__name__
 ]
 
 

@@ -40,7 +40,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if part == "sensor":
             rng = np.random.default_rng(0)
             arrays["color"] = rng.integers(0, 255, (7, 24, 3)).astype(np.uint8)
-            arrays["alike"] = rng.integers(0, 1, (7, 24)).astype(np.uint8)
+            arrays["extra"] = rng.integers(0, 1, (7, 24)).astype(np.uint8)
         write_split(root / part, category, split, arrays, shard_size=3)
     return root
 

@@ -168,7 +168,7 @@ def test_the_sensor_part_has_the_camera_noise_and_foreign_points_of_the_contract
         assert (labels == 255).any()
         assert all(((labels == part).sum(1) >= 16).all() for part in (0, 1))
         steps = 351.3 / arrays["points"][..., 2].astype(float)
-        assert (np.abs(steps - np.rint(steps)) < 1e-3).mean() > 0.95  # all but flying pixels
+        assert (np.abs(steps - np.rint(steps)) < 1e-3).mean() > 0.9  # all but flying pixels
     clean = open_split(made / "clean", "laptop", "train")
     assert "preset" not in clean.manifest.options
     assert (clean.arrays("camera")["camera"][:, 4:] == 256).all()

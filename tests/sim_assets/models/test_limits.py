@@ -23,6 +23,8 @@ from tests.helpers.urdfs import cabinet
 
 SECONDS = 30
 BYTES = 2 << 30
+HUGE = 4 << 30
+"""Larger than any hole that a long run of tests leaves in the heap."""
 
 
 def measured(job: tuple[Path, str], report) -> tuple[str, float, int]:
@@ -92,7 +94,7 @@ def test_memory_is_bounded_and_given_back():
     before = resource.getrlimit(resource.RLIMIT_AS)
     match = "a: expected to be read in 64 MiB of memory, found MemoryError"
     with pytest.raises(AssetError, match=match), bounded(Path("a"), 64 << 20), bounded(Path("b")):
-        np.zeros(100 << 20, np.uint8)
+        np.zeros(HUGE, np.uint8)
     assert resource.getrlimit(resource.RLIMIT_AS) == before
     with limited_memory(1 << 40):
         np.zeros(100 << 20, np.uint8)
@@ -120,7 +122,7 @@ def test_in_another_thread_only_the_memory_is_bounded():
     def work() -> None:
         try:
             with bounded(Path("a"), 64 << 20):
-                np.zeros(100 << 20, np.uint8)
+                np.zeros(HUGE, np.uint8)
         except AssetError as error:
             done.append(str(error))
 
