@@ -21,8 +21,8 @@ from tests.helpers.strategies import generator
 from tests.scapo.training.test_fit import InterruptedRunError, same
 
 DISCOVERY = DiscoveryConfig(
-    seeds=12, rotations=200, searched=12, trusted=(0.9,), starts=1, draws=2, heats=(0.8,), judged=4,
-    template_points=150, final_points=300,
+    seeds=12, rotations=200, searched=12, trusted=(0.9,), starts=1, draws=1, heats=(), judged=4,
+    template_points=120, final_points=240,
 )  # fmt: skip
 
 
