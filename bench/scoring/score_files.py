@@ -37,6 +37,8 @@ COLUMNS = (
     "method", "variant", "seed", "data", "category", "split",
     "sample", "metric", "slot", "value", "unit",
 )  # fmt: skip
+MAX_TEXT = 256 << 20
+"""Bytes of a file of scores, unpacked; 1,000 pairs of glasses take 1.8 million."""
 LONGEST_NAME = 300
 """Characters of a name; a variant is that of the predictions and the readings of the metrics."""
 _RANK = {metric.name: rank for rank, metric in enumerate(METRICS)}
@@ -315,9 +317,12 @@ def _read_frame(path: Path, data: bytes) -> Any:  # noqa: ANN401
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # of numbers that no integer can be
+            with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+                text = file.read(MAX_TEXT + 1)
+            if len(text) > MAX_TEXT:
+                raise ValueError(f"more than {MAX_TEXT} bytes unpacked")
             frame = pd.read_csv(
-                io.BytesIO(data),
-                compression="gzip",
+                io.BytesIO(text),
                 keep_default_na=False,
                 na_values={"value": [""]},
                 dtype=cast("Any", types),

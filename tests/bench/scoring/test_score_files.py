@@ -180,3 +180,10 @@ def test_names_that_look_like_formulas_are_quoted_and_read_back(name, tmp_path):
     text = gzip.decompress((tmp_path / "a.csv.gz").read_bytes()).decode()
     assert all(line.startswith("'") for line in text.splitlines()[1:])
     assert read_scores(tmp_path / "a.csv.gz")[0].run == run
+
+
+def test_what_unpacks_to_more_than_memory_should_hold_is_refused(scores, monkeypatch, capsys):
+    monkeypatch.setattr(score_files, "MAX_TEXT", 1 << 20)
+    bomb = gzip.compress(b"method,variant\n" + b"0" * (1 << 24))
+    scores.write_bytes(bomb)
+    assert "more than 1048576 bytes unpacked" in refusal(scores, capsys)

@@ -90,9 +90,7 @@ def test_a_side_that_inliers_never_saw_is_there_after_a_round(
 ) -> None:
     caplog.set_level("INFO", "scapo.registered.discovery")
     views, truth = sighted(28, seed=91)
-    config = DiscoveryConfig(
-        rotations=300, trusted=(0.8,), template_points=200, final_points=600
-    )
+    config = DiscoveryConfig(rotations=300, trusted=(0.8,), template_points=200, final_points=600)
     left = Inliers(views=views, placement=truth).cameras()[:, 1] < -0.1
     seen = left.nonzero()[:, 0]
     inliers = Inliers(views=take(views, seen), placement=take(truth, seen))
