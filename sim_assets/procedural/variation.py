@@ -16,7 +16,7 @@ from jaxtyping import Float
 from sim_assets.objects import ArticulatedObject
 
 LEAST = 0.15
-"""Coefficient of variation that every main proportion of a category has (CONTRACT 4)."""
+"""Coefficient of variation that every main proportion of a category has (docs/variation.md)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
