@@ -21,6 +21,10 @@ METHODS: dict[str, Method] = {
     "icp": Method(title="ICP", rank=40, maker="bench.baselines.icp:Icp",
                   presets={"paper": "bench.baselines.icp:IcpConfig"},
                   supervision=("segmentation", "pose")),
+    "npcs-epn": Method(title="NPCS-EPN", rank=30, maker="bench.baselines.npcs_epn:NpcsEpn",
+                       presets={"paper": "bench.baselines.npcs_epn:NpcsEpnConfig",
+                                "cpu": "bench.baselines.npcs_epn:cpu_config"},
+                       supervision=("segmentation", "pose", "joint")),
 }  # fmt: skip
 
 

@@ -70,7 +70,6 @@ PUBLISHED = {
     "3dgcn": ("3DGCN", 10),
     "gcn3d": ("3DGCN", 10),
     "pointnet2": ("PointNet++", 20),
-    "npcs-epn": ("NPCS-EPN", 30),
     "eap": ("EAP", 50),
     "op-align": ("OP-Align", 60),
 }

@@ -26,6 +26,13 @@ FLAGS: dict[str, list[str]] = {
         "--discovery.template-points", "60", "--discovery.final-points", "80",
     ],
     "icp": ["--templates", "2"],
+    "npcs-epn": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4", "--points", "64", "--draws", "20",
+        "--network.widths", "4", "8", "--network.strides", "4", "2",
+        "--network.radii", "0.3", "0.6",
+        "--network.neighbours", "6", "6", "--network.frames", "2", "--network.code", "8",
+        "--network.head", "16",
+    ],
 }  # fmt: skip
 
 
