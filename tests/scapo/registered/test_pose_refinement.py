@@ -55,9 +55,7 @@ def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], aside:
         for column in range(motion.jacobian.shape[-1]):
             step = torch.zeros(3, motion.jacobian.shape[-1]).double()
             step[:, column] = 1e-6
-            after, before = (
-                made.place(_move(made, placement, sign * step))[0] for sign in (1, -1)
-            )
+            after, before = (made.place(_move(made, placement, sign * step))[0] for sign in (1, -1))
             torch.testing.assert_close(
                 (after - before) / 2e-6,
                 skin.points @ motion.jacobian[..., column],
