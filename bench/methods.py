@@ -21,6 +21,9 @@ METHODS: dict[str, Method] = {
     "icp": Method(title="ICP", rank=40, maker="bench.baselines.icp:Icp",
                   presets={"paper": "bench.baselines.icp:IcpConfig"},
                   supervision=("segmentation", "pose")),
+    "op-align": Method(title="OP-Align", rank=60, maker="bench.baselines.op_align.method:OpAlign",
+                       presets={"paper": "bench.baselines.op_align.method:OpAlignConfig",
+                                "cpu": "bench.baselines.op_align.method:cpu_config"}),
 }  # fmt: skip
 
 

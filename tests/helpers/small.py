@@ -26,6 +26,13 @@ FLAGS: dict[str, list[str]] = {
         "--discovery.template-points", "60", "--discovery.final-points", "80",
     ],
     "icp": ["--templates", "2"],
+    "op-align": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--backbone.channels", "4", "8", "--backbone.depth", "1", "1", "--backbone.points", "32",
+        "--backbone.neighbours", "8", "--hypotheses.pooled", "8", "--hypotheses.width", "16",
+        "--decoder.points", "48", "--decoder.width", "16", "--point-net.width", "8",
+        "--point-net.blocks", "2", "--chosen-by", "32", "--no-color",
+    ],
 }  # fmt: skip
 
 

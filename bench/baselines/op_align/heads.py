@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
+from scapo.equivariant.layers import ChannelNorm
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import JointPairs, ResidualBlock
@@ -26,19 +27,11 @@ RESIDUAL_RANGE = math.pi / 10
 """Largest angle between a hypothesis and its anchor: 18 degrees, half of what parts anchors."""
 
 
-class Norm(nn.BatchNorm1d):
-    """Batch norm of channels that stand last, over all other axes."""
-
-    def forward(self, input: Float[Tensor, "*B C"]) -> Float[Tensor, "*B C"]:  # noqa: A002
-        """The same shape."""
-        return super().forward(input.reshape(-1, input.shape[-1])).view_as(input)
-
-
 def layers(*sizes: int, slope: float = 0.0) -> list[nn.Module]:
     """Linear layers, each with batch norm and (leaky) ReLU."""
     out: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
-        out += [nn.Linear(inputs, outputs), Norm(outputs), nn.LeakyReLU(slope)]
+        out += [nn.Linear(inputs, outputs), ChannelNorm(outputs), nn.LeakyReLU(slope)]
     return out
 
 

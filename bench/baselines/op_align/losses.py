@@ -115,8 +115,8 @@ def part_share(
     return empty + flat[0] + flat[1]
 
 
-BLOCK = 1 << 22
-"""Distances held at a time on the CPU; a hundred times as many elsewhere."""
+BLOCK = 1 << 15
+"""Distances held at a time on the CPU; a few thousand times as many elsewhere."""
 
 
 @torch.no_grad()
@@ -125,7 +125,7 @@ def hypothesis_distances(
 ) -> Float[Tensor, "B K"]:
     """Mean L1 distance of the points under each hypothesis to the nearest of the shape."""
     count, (n, m) = aligned.shape[1], (aligned.shape[2], canonical.shape[1])
-    block = BLOCK if aligned.device.type == "cpu" else 100 * BLOCK
+    block = BLOCK if aligned.device.type == "cpu" else 4096 * BLOCK
     shape = canonical[:, None].expand(-1, count, -1, -1).flatten(0, 1)
     some = max(1, block // (n * m))
     pairs = zip(aligned.flatten(0, 1).split(some), shape.split(some), strict=True)

@@ -119,7 +119,7 @@ def cpu_config() -> OpAlignConfig:
     """The lean preset: the same structure with fewer points and channels."""
     return OpAlignConfig(
         preset="cpu",
-        backbone=BackboneConfig(channels=(8, 16, 32, 64), points=256, neighbours=16),
+        backbone=BackboneConfig(channels=(8, 16, 32, 64), radius=0.25, neighbours=16, points=128),
         hypotheses=HypothesisConfig(pooled=32, width=128, hidden=32, code=64),
         decoder=DecoderConfig(width=128, points=256),
         point_net=PointNetConfig(width=48, blocks=5, segmentation=(32, 16), joint=(64, 32)),

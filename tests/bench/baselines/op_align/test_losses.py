@@ -152,7 +152,7 @@ def test_part_share_asks_for_points_and_for_doubt() -> None:
     assert float(losses.part_share(first, even)) == pytest.approx(0.01)
 
 
-@pytest.mark.parametrize("block", [1, 1 << 22])
+@pytest.mark.parametrize("block", [1, 1 << 15])
 def test_hypothesis_distances_are_those_of_brute_force(
     block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
