@@ -141,7 +141,9 @@ class SlotAttention(nn.Module):
             state = [
                 _updated(slot, (share[..., None, k].to(x.dtype) @ value)[:, 0], one)
                 if False
-                else _updated(slot, torch.einsum("bn,bnc->bc", share[..., k].to(x.dtype), value), one)
+                else _updated(
+                    slot, torch.einsum("bn,bnc->bc", share[..., k].to(x.dtype), value), one
+                )
                 for k, (slot, value, one) in enumerate(zip(slots, values, state, strict=True))
             ]
         return weights

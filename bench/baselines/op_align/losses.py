@@ -87,9 +87,7 @@ def same_turn(source: JointPairs, target: JointPairs) -> Scalar:
     return (turn[:, 0] - turn[:, 1]).square().mean()
 
 
-def same_base(
-    first: Float[Tensor, "B N 3"], second: Float[Tensor, "B N 3"]
-) -> Scalar:
+def same_base(first: Float[Tensor, "B N 3"], second: Float[Tensor, "B N 3"]) -> Scalar:
     """Mean squared distance between the cloud under the base's map of either joint."""
     return (first - second).square().sum(-1).mean()
 

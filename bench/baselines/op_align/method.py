@@ -125,8 +125,8 @@ def cpu_config() -> OpAlignConfig:
         point_net=PointNetConfig(width=48, blocks=5, segmentation=(32, 16), joint=(64, 32)),
         loss=LossConfig(density_neighbours=16),
         chosen_by=128,
-        epochs=16,
-        decay_every=6,
+        epochs=8,
+        decay_every=3,
         lr=1e-3,
     )
 
@@ -244,7 +244,8 @@ class OpAlign(AbstractMethod):
         observed, canonical = self.point_network(aligned, shape.points)
         if noise is not None:
             observed, canonical = (
-                _disturbed(one, more) for one, more in zip((observed, canonical), noise, strict=True)
+                _disturbed(one, more)
+                for one, more in zip((observed, canonical), noise, strict=True)
             )
         return Alignment(
             hypotheses=hypotheses,
@@ -372,9 +373,7 @@ class OpAlign(AbstractMethod):
             pivot = similarity.forward(labels.joints.pivot) @ turn.mT
             axis = labels.joints.axis @ turn.mT
             joints = e.observed.joints
-            error = labelled_joints(
-                e.place(joints.pivot), joints.axis @ e.rotation.mT, pivot, axis
-            )
+            error = labelled_joints(e.place(joints.pivot), joints.axis @ e.rotation.mT, pivot, axis)
             terms["labelled_joints"] = config.labelled_joints * error
         return terms
 
