@@ -26,6 +26,12 @@ FLAGS: dict[str, list[str]] = {
         "--discovery.template-points", "60", "--discovery.final-points", "80",
     ],
     "icp": ["--templates", "2"],
+    "eap": [
+        "--preset", "cpu", "--epochs", "1", "1", "--batch", "4", "--points", "32",
+        "--encoder.channels", "4", "8", "--encoder.radii", "0.2", "0.3",
+        "--encoder.neighbours", "6", "--whole.width", "8", "--whole.points", "24",
+        "--parts.width", "8", "--parts.points", "12", "--parts.rounds", "2",
+    ],
     "op-align": [
         "--preset", "cpu", "--epochs", "1", "--batch", "4",
         "--backbone.channels", "4", "8", "--backbone.depth", "1", "1", "--backbone.points", "32",

@@ -39,8 +39,10 @@ class BackboneConfig:
     """Compute correlations twice rather than keep them: less memory, more time."""
 
     def plan(self) -> tuple[LevelConfig, ...]:
-        """Every convolution's neighbourhood. The first has the radius of the points it starts
-        from, all others that of the points they end at."""
+        """Every convolution's neighbourhood, which grows with the points it ends at.
+
+        The very first has the radius of the points it starts from.
+        """
         out = []
         for group, depth in enumerate(self.depth):
             for number in range(depth):

@@ -81,8 +81,10 @@ def pivot_near_points(
 
 
 def same_turn(source: JointPairs, target: JointPairs) -> Scalar:
-    """Two joints should turn the frame alike: mean squared difference of the rotations between
-    their axes in both shapes. For three parts."""
+    """Two joints should turn the frame alike, for three parts.
+
+    Mean squared difference of the rotations between their axes in both shapes.
+    """
     turn = rotation_between(source.axis, target.axis)  # (B, J, 3, 3)
     return (turn[:, 0] - turn[:, 1]).square().mean()
 

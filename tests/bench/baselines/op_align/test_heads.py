@@ -31,7 +31,7 @@ def head() -> HypothesisHead:
     made = HypothesisHead(SMALL, 12, ANCHORS)
     initialise(made, generator(0))
     with torch.no_grad():
-        made.residual[-1].weight.mul_(30)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        made.residual[-1].weight.mul_(30)  # pyright: ignore[reportCallIssue]
     return made.eval()
 
 

@@ -145,8 +145,11 @@ def test_part_poses_are_the_rigid_motions_of_the_joints(category: str) -> None:
     assert pose is not None
     y = normal(5, 7, 3).numpy()
     for b in range(2):
-        s, i = ({n: getattr(one.joints, n)[b, 0].double().numpy() for n in ("pivot", "axis", "state")}
-                for one in (e.observed, e.canonical))  # fmt: skip
+        names = ("pivot", "axis", "state")
+        s, i = (
+            {n: getattr(one.joints, n)[b, 0].double().numpy() for n in names}
+            for one in (e.observed, e.canonical)
+        )
         for side in range(2):
             change = s["axis"] * (s["state"][side] - i["state"][side])
             moved = (y - i["pivot"]) @ minimal(i["axis"], s["axis"]).T
@@ -295,20 +298,18 @@ def test_colours_reach_the_network_and_grey_is_a_half() -> None:
     assert float(gradient.abs().sum()) > 0
 
 
-def test_it_overfits_a_batch() -> None:
-    torch.manual_seed(0)
+@pytest.mark.parametrize(
+    ("rounds", "share"), [(40, 0.9), pytest.param(800, 0.1, marks=pytest.mark.slow)]
+)
+def test_it_overfits_a_batch(rounds: int, share: float) -> None:
     made = OpAlign(replace(TINY, direction_noise=0.0), CATEGORIES["laptop"], generator(0)).train()
     observation, _ = plates(4, 48, 2)
     optimiser = torch.optim.Adam(made.parameters(), lr=5e-3)
-    first = last = None
-    for number in range(150):
+    curve = []
+    for number in range(rounds):
         terms = made.losses(observation, Labels(), step(number))
-        fit = terms["rigid"] + terms["art"]
-        first = fit if first is None else first
-        last = fit
+        curve.append(float((terms["rigid"] + terms["art"]).detach()))
         optimiser.zero_grad()
         torch.stack(list(terms.values())).sum().backward()
         optimiser.step()
-    assert first is not None
-    assert last is not None
-    assert float(last.detach()) < 0.25 * float(first.detach())
+    assert np.mean(curve[-5:]) < share * np.mean(curve[:3])
