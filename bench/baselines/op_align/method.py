@@ -11,7 +11,7 @@ R^T x - t under the chosen hypothesis; `canonical`, the decoder's shape.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -95,6 +95,8 @@ class OpAlignConfig:
     """Show the network the colours that the data have; else, and without any, all is grey."""
     color_weight: float = 0.0
     """Of colours in distances; the decoder then has a colour branch. 0 in the published runs."""
+    points: int | None = None
+    """Points of every cloud that a training step draws anew; None = all."""
     chosen_by: int | None = None
     """Points of the cloud that choose the hypothesis; None = all."""
     direction_noise: float = 0.01
@@ -124,7 +126,8 @@ def cpu_config() -> OpAlignConfig:
         decoder=DecoderConfig(width=128, points=256),
         point_net=PointNetConfig(width=48, blocks=5, segmentation=(32, 16), joint=(64, 32)),
         loss=LossConfig(density_neighbours=16),
-        chosen_by=128,
+        points=256,
+        chosen_by=96,
         epochs=8,
         decay_every=3,
         lr=1e-3,
@@ -280,6 +283,7 @@ class OpAlign(AbstractMethod):
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The terms for a batch, times their weights."""
+        observation, labels = self._drawn(observation, labels, step.generator)
         points, similarity = normalise(observation.points)
         turn = self._turns(points, step.generator)
         points = points @ turn.mT
@@ -291,6 +295,24 @@ class OpAlign(AbstractMethod):
         terms = self._reconstruction(e, self.config.loss.rigid_share * 0.5**done)
         terms |= self._regularisers(e)
         return terms | self._labelled(e, labels, similarity, turn)
+
+    def _drawn(
+        self, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> tuple[Observation, Labels]:
+        """Some points of every cloud with their colours and parts."""
+        count, total = self.config.points, observation.points.shape[1]
+        if count is None or count >= total:
+            return observation, labels
+        order = torch.randperm(total, generator=generator, device=generator.device)[:count]
+        color, part = observation.color, labels.part
+        return (
+            replace(
+                observation,
+                points=observation.points[:, order],
+                color=None if color is None else color[:, order],
+            ),
+            replace(labels, part=None if part is None else part[:, order]),
+        )
 
     def _turns(
         self, points: Float[Tensor, "B N 3"], generator: torch.Generator
