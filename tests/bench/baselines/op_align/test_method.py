@@ -27,6 +27,7 @@ from scapo.geometry.rigid import apply
 from scapo.method import Step, StepDecay
 from scapo.types import Joints, Labels, Observation
 from tests.helpers.hinged import plates
+from tests.helpers.small import settle
 from tests.helpers.strategies import generator, normal
 
 TINY = replace(
@@ -53,11 +54,10 @@ def step(seed: int = 0, progress: float = 0.0) -> Step:
 
 
 def tiny(category: str = "laptop", config: OpAlignConfig = TINY) -> OpAlign:
-    """With batch statistics that have seen some clouds."""
-    made = OpAlign(config, CATEGORIES[category], generator(0))
+    """With the statistics of a batch."""
+    made = settle(OpAlign(config, CATEGORIES[category], generator(0)))
     with torch.no_grad():
-        for seed in range(5):
-            made.losses(plates(8, 48, seed)[0], Labels(), step(seed))
+        made.losses(plates(8, 48)[0], Labels(), step())
     return made.eval()
 
 
