@@ -29,6 +29,12 @@ METHODS: dict[str, Method] = {
                        presets={"paper": "bench.baselines.npcs_epn:NpcsEpnConfig",
                                 "cpu": "bench.baselines.npcs_epn:cpu_config"},
                        supervision=("segmentation", "pose", "joint")),
+    "eap": Method(title="EAP", rank=50, maker="bench.baselines.eap.method:Eap",
+                  presets={"paper": "bench.baselines.eap.method:EapConfig",
+                           "cpu": "bench.baselines.eap.method:cpu_config"}),
+    "op-align": Method(title="OP-Align", rank=60, maker="bench.baselines.op_align.method:OpAlign",
+                       presets={"paper": "bench.baselines.op_align.method:OpAlignConfig",
+                                "cpu": "bench.baselines.op_align.method:cpu_config"}),
 }  # fmt: skip
 
 
