@@ -12,10 +12,11 @@ keeps every fourth point of the cloud's order. Heads and losses: `supervised`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
+import tyro
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -43,12 +44,14 @@ class Gcn3dConfig:
     """Points of which a pool takes the greatest feature."""
     fuse: tuple[int, int] = (512, 512)
     """Channels of the layers on all features of a point together."""
-    learning: LearningConfig = field(default_factory=LearningConfig)
+    learning: Annotated[LearningConfig, tyro.conf.arg(name="")] = field(
+        default_factory=LearningConfig
+    )
     """Heads and training."""
 
 
 def cpu_config() -> Gcn3dConfig:
-    """The same network with three directions a kernel, fewer channels and a quarter of the points."""
+    """The same network with three directions a kernel, fewer channels and points."""
     return Gcn3dConfig(
         preset="cpu",
         support=3,
@@ -190,12 +193,12 @@ def pooled(
     neighbours: int,
     generator: torch.Generator | None,
 ) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M C"]]:
-    """A quarter of the points, each with the greatest features of its neighbours.
+    """A quarter of the points, each with the greatest features of its neighbours, not its own.
 
     Args:
         points: Of a level.
         x: Their features.
-        neighbours: Nearest points of which the greatest counts, as many as there are.
+        neighbours: Nearest points but itself of which the greatest counts, as many as there are.
         generator: Draws the quarter; None: every fourth point.
     """
     count = points.shape[1]
@@ -205,13 +208,17 @@ def pooled(
     else:
         chosen = torch.randperm(count, generator=generator, device=generator.device)[:kept]
     centres = points[:, chosen.to(points.device)]
-    index = k_nearest(centres, points, min(neighbours, count))
+    index = k_nearest(centres, points, min(neighbours + 1, count))
+    index = index[..., 1:] if count > 1 else index
     near = gather(x, index.flatten(1)).unflatten(1, index.shape[1:])
     return centres, near.amax(2)
 
 
 class Gcn3dBody(Body):
-    """Five convolutions on three levels, all features of a point joined and fused."""
+    """Five convolutions on three levels, all features of a point and its place joined and fused.
+
+    The place is ours: kernels see directions alone, and votes are places.
+    """
 
     def __init__(self, config: Gcn3dConfig) -> None:
         super().__init__()
@@ -220,7 +227,7 @@ class Gcn3dBody(Body):
         self.surface = Surface(w[0], s)
         self.convolutions = nn.ModuleList([Convolution(w[i], w[i + 1], s) for i in range(4)])
         self.norms = nn.ModuleList([nn.BatchNorm1d(w[i]) for i in (1, 2, 3)])
-        joined = sum(w) + w[4]
+        joined = 3 + sum(w) + w[4]
         self.fuse = nn.Sequential(
             nn.Linear(joined, config.fuse[0]),
             nn.ReLU(),
@@ -241,13 +248,12 @@ class Gcn3dBody(Body):
         near = graph(middle, config.neighbours)
         x2 = self._convolve(1, near, x.flatten(0, 1))
         x3 = self._convolve(2, near, x2)
-        coarse, x = pooled(
-            middle, x3.unflatten(0, (batch, -1)), config.pool_neighbours, generator
-        )
+        coarse, x = pooled(middle, x3.unflatten(0, (batch, -1)), config.pool_neighbours, generator)
         x4 = self.convolutions[3](graph(coarse, config.neighbours), x.flatten(0, 1))
         code = x4.unflatten(0, (batch, -1)).amax(1)
         to_middle, to_coarse = nearest(points, middle), nearest(points, coarse)
         levels = [
+            points,
             x0.unflatten(0, (batch, -1)),
             x1,
             *(gather(x.unflatten(0, (batch, -1)), to_middle) for x in (x2, x3)),
@@ -266,9 +272,7 @@ class Gcn3d(SupervisedMethod):
 
     name: ClassVar[str] = "gcn3d"
 
-    def __init__(
-        self, config: Gcn3dConfig, category: Category, generator: torch.Generator
-    ) -> None:
+    def __init__(self, config: Gcn3dConfig, category: Category, generator: torch.Generator) -> None:
         """Draw the weights from `generator`."""
         super().__init__(config, category, lambda: Gcn3dBody(config), generator)
 

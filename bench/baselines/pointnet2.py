@@ -12,10 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
+import tyro
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
@@ -58,12 +59,14 @@ class PointNet2Config:
     """Channels of the layers on the whole cloud; the last are its code."""
     back_widths: tuple[Widths, Widths, Widths] = ((256, 256), (256, 128), (128, 128))
     """Channels on the way back: to the groups of groups, the groups, the points."""
-    learning: LearningConfig = field(default_factory=LearningConfig)
+    learning: Annotated[LearningConfig, tyro.conf.arg(name="")] = field(
+        default_factory=LearningConfig
+    )
     """Heads and training."""
 
 
 def cpu_config() -> PointNet2Config:
-    """The same network with a quarter of the groups, smaller groups and half the channels."""
+    """The same network with an eighth of the groups, smaller ones, and half the channels."""
     return PointNet2Config(
         preset="cpu",
         centres=(64, 16),
@@ -137,7 +140,9 @@ class PointNet2Body(Body):
     def __init__(self, config: PointNet2Config) -> None:
         super().__init__()
         self.config = config
-        near, far = (sum(w[-1] for w in widths) for widths in (config.near_widths, config.far_widths))
+        near, far = (
+            sum(w[-1] for w in widths) for widths in (config.near_widths, config.far_widths)
+        )
         self.near = nn.ModuleList([Groups(3, widths) for widths in config.near_widths])
         self.far = nn.ModuleList([Groups(near, widths) for widths in config.far_widths])
         self.whole = _blocks(3 + far, config.whole_widths)
@@ -168,9 +173,7 @@ class PointNet2Body(Body):
             torch.cat([near, interpolate(far, *interpolation(centres, middles))], -1)
         )
         back = interpolate(near, *interpolation(points, centres))
-        return Features(
-            points=self.back_points(torch.cat([points, back], -1)), code=code
-        )
+        return Features(points=self.back_points(torch.cat([points, back], -1)), code=code)
 
     def _abstract(
         self,

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from scapo.categories import Category, JointKind
+from scapo.categories import Category
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import MEAN_RADIUS, gather, k_nearest, normalise
 from scapo.geometry.rigid import apply, invert, mean_rotation, random_rotations, rigid
@@ -183,9 +183,7 @@ class Heads(nn.Module):
         width = config.width
         self.segment = nn.Linear(body.features, self.parts)
         if config.pose == "votes":
-            self.vote = nn.Sequential(
-                Block(body.features, width), nn.Linear(width, 3 * self.parts)
-            )
+            self.vote = nn.Sequential(Block(body.features, width), nn.Linear(width, 3 * self.parts))
         else:
             self.regress = _two_layers(body.features + body.code, width, 9)
         self.joint = _two_layers(body.code, width, 6 * self.joints)
@@ -327,7 +325,7 @@ def poses_by_vote(
     weight: Float[Tensor, "B N P"],
 ) -> Float[Tensor, "B P 4 4"]:
     """The pose of each part that its votes agree on best, those far off counting less."""
-    batch, number, parts, _ = votes.shape
+    batch, _, parts, _ = votes.shape
     source = votes.transpose(1, 2).flatten(0, 1)  # (B P, N, 3)
     target = points[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
     given = weight.transpose(1, 2).flatten(0, 1)
@@ -429,9 +427,7 @@ class SupervisedMethod(AbstractMethod, ABC):
         """Nothing to prepare."""
         del stage, observation, labels, generator
 
-    def answer(
-        self, points: Float[Tensor, "B N 3"], generator: torch.Generator | None
-    ) -> Answer:
+    def answer(self, points: Float[Tensor, "B N 3"], generator: torch.Generator | None) -> Answer:
         """Run body and heads."""
         return self.heads(points, self.body(points, generator), generator)
 

