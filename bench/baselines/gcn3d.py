@@ -20,7 +20,8 @@ import tyro
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from bench.baselines.supervised import Body, Features, LearningConfig, SupervisedMethod
+from bench.baselines.body import Body, Features
+from bench.baselines.supervised import LearningConfig, SupervisedMethod
 from scapo.categories import Category
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import gather, k_nearest, nearest
@@ -110,7 +111,8 @@ class GreatestResponse(torch.autograd.Function):
         directions, kernels, features, index, winner = ctx.saved_tensors
         winner = winner.long()
         steps = [directions[..., axis].gather(1, winner) for axis in range(3)]  # (M, C) each
-        cosine = sum(step * kernel for step, kernel in zip(steps, kernels, strict=True)).relu_()
+        x, y, z = (step * kernel for step, kernel in zip(steps, kernels, strict=True))
+        cosine = (x + y + z).relu_()
         to_features = None
         to_cosine = gradient * (cosine > 0)
         if features is not None:

@@ -20,19 +20,17 @@ import tyro
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from bench.baselines.supervised import (
-    Block,
-    Body,
-    Features,
-    LearningConfig,
-    SupervisedMethod,
-    interpolate,
-    interpolation,
-)
+from bench.baselines.body import Block, Body, Features
+from bench.baselines.supervised import LearningConfig, SupervisedMethod
 from scapo.categories import Category
-from scapo.geometry.points import farthest_points, gather
+from scapo.geometry.points import farthest_points, gather, k_nearest
 
 Widths = tuple[int, ...]
+
+NEIGHBOURS = 3
+"""Points that a point without features of its own takes them from."""
+ZERO = 1e-9
+"""Squared length added to distances whose inverse is a weight."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +99,31 @@ def in_balls(
         top, index = score.topk(min(count, number), -1)
         found.append(torch.where(top > 0, index, index[..., :1]))
     return found
+
+
+@torch.no_grad()
+def interpolation(
+    here: Float[Tensor, "B N 3"], there: Float[Tensor, "B M 3"]
+) -> tuple[Int[Tensor, "B N K"], Float[Tensor, "B N K"]]:
+    """The nearest three of the points `there`, and weights by inverse squared distance, sum 1."""
+    index = k_nearest(here, there, min(NEIGHBOURS, there.shape[1]))
+    near = gather(there, index.flatten(1)).unflatten(1, index.shape[1:])
+    weight = 1 / ((near - here[:, :, None]).square().sum(-1) + ZERO)
+    return index, weight / weight.sum(-1, keepdim=True)
+
+
+def interpolate(
+    values: Float[Tensor, "B M C"], index: Int[Tensor, "B N K"], weight: Float[Tensor, "B N K"]
+) -> Float[Tensor, "B N C"]:
+    """Weighted means of the values of the points that `index` names."""
+    batch, rows, near = index.shape
+    start = torch.arange(batch, device=index.device)[:, None] * values.shape[1]
+    return F.embedding_bag(
+        (index.flatten(1) + start).view(-1, near),
+        values.flatten(0, 1),
+        mode="sum",
+        per_sample_weights=weight.flatten(0, 1).to(values.dtype),
+    ).view(batch, rows, -1)
 
 
 class Groups(nn.Module):

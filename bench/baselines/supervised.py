@@ -24,9 +24,10 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from bench.baselines.body import Block, Body, Features
 from scapo.categories import Category
 from scapo.geometry.numerics import at_least_float32
-from scapo.geometry.points import MEAN_RADIUS, gather, k_nearest, normalise
+from scapo.geometry.points import MEAN_RADIUS, gather, normalise
 from scapo.geometry.rigid import apply, invert, mean_rotation, random_rotations, rigid
 from scapo.geometry.rotations import rotmat_to_rotvec
 from scapo.method import AbstractMethod, Mode, Stage, Step, changes
@@ -41,10 +42,8 @@ SMOOTH = 1e-4
 """Squared length under the root of a distance, which so has a gradient everywhere."""
 BEND = 0.05
 """Length up to which the smooth L1 losses are quadratic."""
-NEIGHBOURS = 3
-"""Points that a point without features of its own takes them from."""
-ROUNDS, TRUST = 5, 0.05
-"""Of the Procrustes step, each of which weighs votes by 1 / (1 + (off / TRUST)^2)."""
+ROUNDS, TRUST = 4, 0.05
+"""Repetitions of the Procrustes step, each with votes weighed by 1 / (1 + (off / TRUST)^2)."""
 TINY = 1e-6
 
 
@@ -88,73 +87,6 @@ class LearningConfig:
     """Added to the gradient."""
     batch: int = 16
     """Clouds a step."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Features:
-    """What a body says of a cloud."""
-
-    points: Float[Tensor, "B N C"]
-    code: Float[Tensor, "B G"]
-
-
-class Body(nn.Module, ABC):
-    """A point network."""
-
-    features: int
-    """Channels of each point."""
-    code: int
-    """Channels of the whole."""
-    least_points: int
-    """Points that it needs."""
-
-    @abstractmethod
-    def forward(
-        self, points: Float[Tensor, "B N 3"], generator: torch.Generator | None
-    ) -> Features:
-        """Features of clouds of mean radius 0.5; random choices only where a generator is given."""
-
-
-class Block(nn.Module):
-    """A pointwise linear layer, batch norm and ReLU."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(inputs, outputs)
-        self.norm = nn.BatchNorm1d(outputs)
-
-    def forward(self, x: Float[Tensor, "*B I"]) -> Float[Tensor, "*B O"]:
-        """Over the last axis."""
-        return self.activate(self.linear(x))
-
-    def activate(self, x: Float[Tensor, "*B O"]) -> Float[Tensor, "*B O"]:
-        """What follows the linear layer."""
-        return F.relu(self.norm(x.flatten(0, -2)).view_as(x))
-
-
-@torch.no_grad()
-def interpolation(
-    here: Float[Tensor, "B N 3"], there: Float[Tensor, "B M 3"]
-) -> tuple[Int[Tensor, "B N K"], Float[Tensor, "B N K"]]:
-    """The nearest three of the points `there`, and weights by inverse squared distance, sum 1."""
-    index = k_nearest(here, there, min(NEIGHBOURS, there.shape[1]))
-    near = gather(there, index.flatten(1)).unflatten(1, index.shape[1:])
-    weight = 1 / ((near - here[:, :, None]).square().sum(-1) + TINY**1.5)
-    return index, weight / weight.sum(-1, keepdim=True)
-
-
-def interpolate(
-    values: Float[Tensor, "B M C"], index: Int[Tensor, "B N K"], weight: Float[Tensor, "B N K"]
-) -> Float[Tensor, "B N C"]:
-    """Weighted means of the values of the points that `index` names."""
-    batch, rows, near = index.shape
-    start = torch.arange(batch, device=index.device)[:, None] * values.shape[1]
-    return F.embedding_bag(
-        (index.flatten(1) + start).view(-1, near),
-        values.flatten(0, 1),
-        mode="sum",
-        per_sample_weights=weight.flatten(0, 1).to(values.dtype),
-    ).view(batch, rows, -1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -329,11 +261,10 @@ def poses_by_vote(
     source = votes.transpose(1, 2).flatten(0, 1)  # (B P, N, 3)
     target = points[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
     given = weight.transpose(1, 2).flatten(0, 1)
-    trust = torch.ones_like(given)
+    rotation, shift = procrustes(target, source, given)
     for _ in range(ROUNDS):
-        rotation, shift = procrustes(target, source, given * trust)
         off = (source @ rotation.mT + shift[:, None] - target).square().sum(-1)
-        trust = 1 / (1 + off / TRUST**2)
+        rotation, shift = procrustes(target, source, given / (1 + off / TRUST**2))
     return rigid(rotation, shift).unflatten(0, (batch, parts))
 
 

@@ -50,11 +50,10 @@ def hinged_data(
     """
     for split, count in (("train", train), ("test", test)):
         observation, labels = plates(count, POINTS, seed=count)
-        assert labels.camera_T_part is not None
-        assert labels.joints is not None
-        assert labels.part is not None
         if wrong:
             _, labels = plates(count, POINTS, seed=count + 100)
+        assert labels.camera_T_part is not None
+        assert labels.joints is not None
         assert labels.part is not None
         change = {
             "points": observation.points.numpy(),

@@ -8,7 +8,15 @@ import torch
 import torch.nn.functional as F
 from torch.testing import assert_close
 
-from bench.baselines.pointnet2 import Groups, PointNet2Body, PointNet2Config, cpu_config, in_balls
+from bench.baselines.pointnet2 import (
+    Groups,
+    PointNet2Body,
+    PointNet2Config,
+    cpu_config,
+    in_balls,
+    interpolate,
+    interpolation,
+)
 from scapo.geometry.points import farthest_points, gather
 from scapo.paper.vector_neurons import initialise
 from tests.helpers.strategies import generator, normal
@@ -39,6 +47,22 @@ def test_balls_against_loops() -> None:
                 padded = first + first[:1] * (min(count, 40) - len(first))
                 assert index[b, s].tolist() == padded
     assert len(sizes) > 4  # crowded groups, and groups of one
+
+
+@pytest.mark.parametrize("there", [1, 2, 30])
+def test_interpolation_against_loops(there: int) -> None:
+    here, points = normal(0, 2, 20, 3).float(), normal(1, 2, there, 3).float()
+    values = normal(2, 2, there, 5).float()
+    found = interpolate(values, *interpolation(here, points))
+    for b in range(2):
+        for n in range(20):
+            square = (points[b] - here[b, n]).square().sum(1)
+            near = square.sort().indices[:3]
+            weight = 1 / (square[near] + 1e-9)
+            expected = (weight[:, None] * values[b, near]).sum(0) / weight.sum()
+            assert_close(found[b, n], expected, atol=1e-4, rtol=1e-3)
+    there_itself = interpolate(values, *interpolation(points, points))
+    assert_close(there_itself, values, atol=1e-4, rtol=0)
 
 
 def test_groups_against_loops() -> None:
