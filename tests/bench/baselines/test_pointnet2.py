@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch.testing import assert_close
 
+from bench.baselines.body import Block
 from bench.baselines.pointnet2 import (
     Groups,
     PointNet2Body,
@@ -80,10 +81,10 @@ def test_groups_against_loops() -> None:
     ]  # fmt: skip
     x = torch.stack(rows)
     for layer in groups.layers:
-        linear, norm = layer.get_submodule("linear"), layer.get_submodule("norm")
-        x = linear(x)
+        assert isinstance(layer, Block)
+        x = layer.linear(x)
         x = (x - x.mean(0)) / (x.var(0, unbiased=False) + 1e-5).sqrt()  # as batch norm starts
-        assert torch.equal(norm.get_parameter("weight"), torch.ones(x.shape[1]).double())
+        assert torch.equal(layer.norm.weight, torch.ones(x.shape[1]).double())
         x = F.relu(x)
     assert_close(found, x.view(2, 4, 6, 6).amax(2))
 
