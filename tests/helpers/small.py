@@ -53,6 +53,14 @@ FLAGS: dict[str, list[str]] = {
         "--decoder.points", "48", "--decoder.width", "16", "--point-net.width", "8",
         "--point-net.blocks", "2", "--chosen-by", "32", "--no-color",
     ],
+    "pointnet2": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--centres", "16", "4", "--whole-widths", "32", "32",
+    ],
+    "gcn3d": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--widths", "8", "8", "16", "16", "32", "--fuse", "32", "32",
+    ],
 }  # fmt: skip
 
 
@@ -71,10 +79,17 @@ POINTS = 160
 """Of each cloud."""
 
 
-def hinged_data(folder: Path, *, train: int = 12, test: int = 5, color: bool = False) -> Path:
-    """A train and a test split of two plates that turn, as laptops; colours come with sensors."""
+def hinged_data(
+    folder: Path, *, train: int = 12, test: int = 5, color: bool = False, wrong: bool = False
+) -> Path:
+    """A train and a test split of two plates that turn, as laptops; colours come with sensors.
+
+    `wrong`: labels of other clouds.
+    """
     for split, count in (("train", train), ("test", test)):
         observation, labels = plates(count, POINTS, seed=count)
+        if wrong:
+            _, labels = plates(count, POINTS, seed=count + 100)
         assert labels.camera_T_part is not None
         assert labels.joints is not None
         assert labels.part is not None
