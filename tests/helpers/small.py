@@ -40,6 +40,14 @@ FLAGS: dict[str, list[str]] = {
         "--network.neighbours", "6", "6", "--network.frames", "2", "--network.code", "8",
         "--network.head", "16",
     ],
+    "pointnet2": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--centres", "16", "4", "--whole-widths", "32", "32",
+    ],
+    "gcn3d": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--widths", "8", "8", "16", "16", "32", "--fuse", "32", "32",
+    ],
     "eap": [
         "--preset", "cpu", "--epochs", "1", "1", "--batch", "4", "--points", "32",
         "--encoder.channels", "4", "8", "--encoder.radii", "0.2", "0.3",
@@ -52,14 +60,6 @@ FLAGS: dict[str, list[str]] = {
         "--backbone.neighbours", "8", "--hypotheses.pooled", "8", "--hypotheses.width", "16",
         "--decoder.points", "48", "--decoder.width", "16", "--point-net.width", "8",
         "--point-net.blocks", "2", "--chosen-by", "32", "--no-color",
-    ],
-    "pointnet2": [
-        "--preset", "cpu", "--epochs", "1", "--batch", "4",
-        "--centres", "16", "4", "--whole-widths", "32", "32",
-    ],
-    "gcn3d": [
-        "--preset", "cpu", "--epochs", "1", "--batch", "4",
-        "--widths", "8", "8", "16", "16", "32", "--fuse", "32", "32",
     ],
 }  # fmt: skip
 
