@@ -15,6 +15,7 @@ import numpy as np
 from scapo.categories import JointSpec
 from scapo.geometry.matrices import rotation_error
 from scapo.store.json_records import StoreError, from_json, read_json
+from scapo.store.regular import NOT_OWN, is_odd
 
 FORMAT = "scapo-manifest/1"
 
@@ -101,9 +102,12 @@ def read_manifest(path: Path | str) -> Manifest:
     """Read and validate; fields that this version does not know are left alone.
 
     Raises:
-        ManifestError: No file, broken JSON, another format, a missing or contradictory field.
+        ManifestError: No file, or a link, a pipe or a device; broken JSON, another format, a
+            missing or contradictory field.
     """
     path = Path(path)
+    if is_odd(path):
+        raise ManifestError(f"{path}: {NOT_OWN}")
     if not path.exists():
         raise ManifestError(f"{path}: expected a manifest, found no file")
     data = read_json(path, ManifestError)
@@ -123,8 +127,10 @@ def _expect(holds: bool, message: str) -> None:
 
 
 def _unique(path: Path, what: str, names: Sequence[str]) -> None:
-    for i, name in enumerate(names):
-        _expect(name not in names[:i], f"{path}: expected different {what}, found {name!r} twice")
+    seen: set[str] = set()
+    for name in names:
+        _expect(name not in seen, f"{path}: expected different {what}, found {name!r} twice")
+        seen.add(name)
 
 
 def _check_joints(path: Path, manifest: Manifest) -> None:

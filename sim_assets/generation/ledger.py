@@ -20,7 +20,7 @@ from typing import Any
 from scapo.store import canonical_json, sha256_file, write_bytes
 from scapo.store.json_records import StoreError, from_json, read_json
 from scapo.store.manifest import Instance, Manifest, ManifestError, read_manifest
-from scapo.store.regular import read_regular
+from scapo.store.regular import NOT_OWN, is_odd, read_regular
 from scapo.text import one_line
 from sim_assets.generation.assets import Asset
 from sim_assets.generation.plan import Entry
@@ -222,12 +222,9 @@ class Ledger:
                 )
 
     def _refuse_odd(self) -> None:
-        """Records that are links lead to other people's files, pipes and devices nowhere."""
         for path in (self.folder / name for name in ("manifest.json", PLAN, FINISHED)):
-            if path.is_symlink() or (path.exists() and not path.is_file()):
-                raise GenerateError(
-                    f"{path}: expected a file of its own, found a link, a folder or a device"
-                )
+            if is_odd(path):
+                raise GenerateError(f"{path}: {NOT_OWN}")
 
     def _read_plan(self) -> _Plan:
         path = self.folder / PLAN

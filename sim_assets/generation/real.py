@@ -22,6 +22,7 @@ from sim_assets.generation.plan import Entry
 from sim_assets.generation.shard import describe
 from sim_assets.models.joints import words
 from sim_assets.models.library import find, instance_id, source_root
+from sim_assets.models.limits import CLOCK_SECONDS
 
 INDEX = "index.csv"
 KINDS: dict[str, tuple[str, ...]] = {
@@ -94,9 +95,10 @@ def readable(
     Raises:
         ValueError: None can.
     """
-    outcomes = {outcome.job.name: outcome for outcome in pool.run(describe, models)}
+    done = pool.run(describe, models, within=CLOCK_SECONDS)
+    outcomes = {outcome.job.name: outcome for outcome in done}
     refused = {
-        model.name: outcomes[model.name].reason.replace(f"{model.root}/", "")
+        model.name: outcomes[model.name].reason
         for model in models
         if outcomes[model.name].result is None
     }

@@ -23,7 +23,7 @@ from sim_assets.importers import partnet_mobility as partnet_models
 from sim_assets.importers.clouds import CloudFile
 from sim_assets.importers.models import Folder, Model
 from sim_assets.importers.splits import CloudReader, SplitWriter, import_split
-from sim_assets.models.limits import bounded
+from sim_assets.models.limits import CLOCK_SECONDS, bounded
 
 SetName = Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "partnet-mobility"]
 Progress = Callable[[str, int, int], None]
@@ -162,7 +162,8 @@ def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls:
     refused = len(folders) - len(jobs)
     show("models", refused, len(folders))
     written: dict[Path, tuple[Path, tuple[str, ...]]] = {}
-    for done, outcome in enumerate(pool.run(write_model, jobs), refused + 1):
+    outcomes = pool.run(write_model, jobs, within=CLOCK_SECONDS)
+    for done, outcome in enumerate(outcomes, refused + 1):
         if outcome.result is None:
             refuse(outcome.job.folder.path, outcome.reason)
         else:

@@ -27,6 +27,10 @@ READ_MEMORY = 1 << 30
 READ_SECONDS = 20.0
 """Processor seconds that reading one asset may take: not the clock's, so that a busy machine
 refuses nothing that an idle one accepts. An STL of 2.6 million triangles takes a third of them."""
+CLOCK_SECONDS = 30.0
+"""Seconds by the clock after which a worker that reads an asset for the first time is ended. If it
+had the processor for most of them the asset is refused; else the machine was slow, and the asset is
+read again after the others, for as long as `--timeout` allows."""
 TICK = 0.5
 """Processor seconds between looks at the clock."""
 

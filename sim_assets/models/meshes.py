@@ -19,7 +19,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from sim_assets.models.resolver import MeshResolver, SourceFiles
 from sim_assets.models.robot import Color, Robot, Shape, ShapeKind
-from sim_assets.models.sides import two_sided
+from sim_assets.models.sides import two_sided, used_vertices
 from sim_assets.models.textures import find_image, is_readable, only_pictures
 from sim_assets.models.validate import MAX_COORDINATE, MAX_FACES, AssetError, check_mesh, refuse
 from sim_assets.objects import Visual
@@ -194,7 +194,7 @@ def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visu
             faces = faces[:, ::-1]
     pose = shape.link_T_shape
     moved = vertices @ pose[:3, :3].T + pose[:3, 3]
-    if not (np.abs(moved[np.unique(faces)]) <= MAX_COORDINATE).all():
+    if not (np.abs(moved[used_vertices(faces)]) <= MAX_COORDINATE).all():
         raise refuse(files.urdf, f"{where}: coordinates below {MAX_COORDINATE:g}", "larger ones")
     mesh = remade(piece.mesh, moved, faces)
     if shape.color is None:
