@@ -141,9 +141,7 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
             while waiting or self._running:
                 while waiting and len(self._running) < self._slots():
                     attempt = waiting.popleft()
-                    attempt.stream = task.remote(
-                        function, attempt.job, self.timeout, within
-                    )
+                    attempt.stream = task.remote(function, attempt.job, self.timeout, within)
                     self._running.append(attempt)
                 streams = [attempt.stream for attempt in self._running]
                 ready, _ = self._ray.wait(

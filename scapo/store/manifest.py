@@ -16,8 +16,11 @@ from scapo.categories import JointSpec
 from scapo.geometry.matrices import rotation_error
 from scapo.store.json_records import StoreError, from_json, read_json
 from scapo.store.regular import NOT_OWN, is_odd
+from scapo.text import is_word
 
 FORMAT = "scapo-manifest/1"
+MAX_POINTS = 1 << 24
+"""Of a shard, which is read whole: a quarter of a gigabyte."""
 
 
 class ManifestError(StoreError):
@@ -115,6 +118,9 @@ def read_manifest(path: Path | str) -> Manifest:
         found = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise ManifestError(f"{path}: expected format {FORMAT!r}, found {found!r}")
     manifest = from_json(Manifest, data, str(path), error=ManifestError)
+    for name in ("category", "split"):
+        found = getattr(manifest, name)
+        _expect(is_word(found), f"{path}: {name}: expected a folder's name, found {found!r}")
     _check_joints(path, manifest)
     _check_instances(path, manifest)
     _check_shards(path, manifest)
@@ -192,6 +198,11 @@ def _check_shards(path: Path, manifest: Manifest) -> None:
             shard.first == first and shard.count > 0,
             f"{path}: shard {shard.file}: expected first {first} and a count of 1 or more, "
             f"found {shard.first} and {shard.count}",
+        )
+        _expect(
+            shard.count * manifest.points <= MAX_POINTS,
+            f"{path}: shard {shard.file}: expected at most {MAX_POINTS} points, found "
+            f"{shard.count} samples of {manifest.points}",
         )
         _expect(
             shard.file not in ("", "..") and Path(shard.file).name == shard.file,

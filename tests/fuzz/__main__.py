@@ -32,9 +32,10 @@ def main() -> int:
     options = parser.parse_args()
     counts = {name: Counter[str]() for name in options.only}
     until, first, bad = time.monotonic() + options.seconds, options.first, []
-    with tempfile.TemporaryDirectory() as place, Pool[Any, Any](
-        options.workers, timeout=TIMEOUT
-    ) as pool:
+    with (
+        tempfile.TemporaryDirectory() as place,
+        Pool[Any, Any](options.workers, timeout=TIMEOUT) as pool,
+    ):
         while time.monotonic() < until:
             for outcome in pool.run(play_batch, [(name, place, first) for name in options.only]):
                 name = outcome.job[0]

@@ -62,7 +62,7 @@ def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
     with pytest.raises(GenerateError, match=message):
         generate(request, assets, tmp_path / "split", {}, Running(workers=0))
     monkeypatch.setattr("sim_assets.generation.ledger.write_bytes", full)
-    with pytest.raises(GenerateError, match=r"other: expected to be written to, found: No space"):
+    with pytest.raises(GenerateError, match=r"other: expected to be written, found: No space"):
         generate(request, assets, tmp_path / "other", {}, Running(workers=0))
 
 
