@@ -32,8 +32,9 @@ MAX_CHAIN = 64
 """Joints that mimic one another in a row."""
 MAX_WORDS = 300
 """Characters of what was expected, and of what was found."""
-MAX_FACES = 5_000_000
-"""Triangles of a whole asset: a 2.6 million triangle STL still loads in seconds."""
+MAX_FACES = 2_500_000
+"""Triangles of a whole asset, both sides of open surfaces counted: about twice as many as can be
+read in the memory that `limits` allows."""
 MAX_COORDINATE = 1e5
 """Asset units; beyond it float32 pictures lose the millimetre even for models in millimetres."""
 
