@@ -29,6 +29,8 @@ PREDICTIONS = "scapo-predictions/1"
 CHECKPOINT = "scapo-checkpoint/1"
 MAX_VALUES = 1 << 27
 """Numbers that are read at once, half a gigabyte of float32: a sparse file may say terabytes."""
+MAX_HASHED = 4 << 30
+"""Bytes of a file whose digest is asked for."""
 
 Arrays = dict[str, np.ndarray]
 Header = dict[str, Any]
@@ -45,9 +47,16 @@ def sha256_bytes(data: bytes) -> str:
 
 
 def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes in hex, read in pieces."""
+    """SHA-256 of a file's bytes in hex, read in pieces.
+
+    Raises:
+        StoreError: It is larger than any that is read here: a sparse file may have terabytes.
+    """
     digest = hashlib.sha256()
     with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > MAX_HASHED:
+            raise StoreError(f"{path}: expected at most {MAX_HASHED} bytes, found {size}")
         while piece := file.read(1 << 20):
             digest.update(piece)
     return digest.hexdigest()

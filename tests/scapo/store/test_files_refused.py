@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from scapo.store.files import read, read_header, require, write
+from scapo.store.files import read, read_header, require, sha256_file, write
 from scapo.store.schema import StoreError
 
 HEADER = {"format": "scapo-test/1", "list": [1, 2.5, None], "text": "Größe 尺"}
@@ -135,3 +135,10 @@ def test_tensors_of_terabytes_are_refused_unread(path: Path) -> None:
     with pytest.raises(StoreError, match=r"a\.safetensors: expected at most \d+ numbers, "):
         read(path)
     assert read(path, names=("x",))[0]["x"].tolist() == [1.0, 1.0]
+
+
+def test_a_sparse_file_of_terabytes_has_no_digest(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)
+    with pytest.raises(StoreError, match=r"a\.safetensors: expected at most 4294967296 bytes"):
+        sha256_file(path)
