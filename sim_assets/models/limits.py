@@ -72,18 +72,18 @@ def bounded(path: Path, memory: int = READ_MEMORY) -> Iterator[None]:
     except (AssetError, UnpickleError):
         raise
     except (Exception, _TooLongError) as error:
-        raise refuse(path, *_words(error, memory)) from error
+        raise refuse(path, *_words(path, error, memory)) from error
     finally:
         _bounded.active = False
 
 
-def _words(error: BaseException, memory: int) -> tuple[str, str]:
+def _words(path: Path, error: BaseException, memory: int) -> tuple[str, str]:
     """What was expected, and what was found."""
     if isinstance(error, _TooLongError):
         return f"to be read in {READ_SECONDS:g} s", "that it takes longer"
     if isinstance(error, MemoryError):
-        expected = f"to be read in {memory >> 20} MiB of memory, as a million triangles are"
-        return expected, f"MemoryError {error}"
+        hint = ", as a million triangles are" if path.suffix == ".urdf" else ""
+        return f"to be read in {memory >> 20} MiB of memory{hint}", f"MemoryError {error}"
     if isinstance(error, RecursionError):
         return "contents of sane depth", "deeper ones"
     return "to be read", f"{type(error).__name__}: {error}"

@@ -7,7 +7,6 @@ URDF primitives as fine closed meshes: SAPIEN's own are off by millimetres.
 from __future__ import annotations
 
 import io
-import logging
 import math
 import re
 import warnings
@@ -130,7 +129,7 @@ def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[
 @contextmanager
 def _silent() -> Iterator[None]:
     """Without what the loaders print of what they leave out: it is said in our words."""
-    logger = logging.getLogger("trimesh")
+    logger = trimesh.util.log
     before, logger.disabled = logger.disabled, True
     try:
         with warnings.catch_warnings():

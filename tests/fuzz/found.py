@@ -84,7 +84,7 @@ FOUND: tuple[tuple[str, Change], ...] = (
     ("shape2motion NPY", bytes_of(b"numpy", UNPRINTABLE)),
     ("OP-Align PT", member("data.pkl", bytes_of(b"torch", UNPRINTABLE))),
     ("manifest", node('"../../evil"', "category")),
-    ("manifest", node('"/tmp/evil"', "category")),
+    ("manifest", node('"/etc/evil"', "category")),
     ("manifest", node('".."', "split")),
     ("manifest", node("1000000000000", "points")),
     ("manifest", lambda data: b'{"count": 3,' + data.lstrip()[1:]),

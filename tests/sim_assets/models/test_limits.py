@@ -9,6 +9,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -201,7 +202,7 @@ def test_numbers_that_overflow_print_nothing(tmp_path: Path, capfd: pytest.Captu
 def test_what_a_loader_leaves_out_is_not_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture):
     """A picture that is named and not there is a traceback in the loader's log."""
     cabinet(tmp_path, ("body.obj", "body.ply"))
-    data = trimesh.creation.box(BODY).export(file_type="ply", encoding="ascii")
+    data: Any = trimesh.creation.box(BODY).export(file_type="ply", encoding="ascii")
     head = b"format ascii 1.0\n"
     named = data.replace(head, head + b"comment TextureFile /etc/passwd\n")
     (tmp_path / "meshes/body.ply").write_bytes(named)
