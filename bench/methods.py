@@ -25,6 +25,12 @@ METHODS: dict[str, Method] = {
                            maker="bench.baselines.kiss_matcher:KissMatcher",
                            presets={"cpu": "bench.baselines.kiss_matcher:KissMatcherConfig"},
                            supervision=("segmentation", "pose", "joint", "instance")),
+    "eap": Method(title="EAP", rank=50, maker="bench.baselines.eap.method:Eap",
+                  presets={"paper": "bench.baselines.eap.method:EapConfig",
+                           "cpu": "bench.baselines.eap.method:cpu_config"}),
+    "op-align": Method(title="OP-Align", rank=60, maker="bench.baselines.op_align.method:OpAlign",
+                       presets={"paper": "bench.baselines.op_align.method:OpAlignConfig",
+                                "cpu": "bench.baselines.op_align.method:cpu_config"}),
 }  # fmt: skip
 
 
