@@ -30,6 +30,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
     Raises:
         ValueError: Something is in the way that is not `made_here`.
+        OSError: It cannot be written, and which file.
     """
     refuse_foreign(folder, made_here)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -40,6 +41,9 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         record = {"format": FORMAT, "files": digests(temporary)}
         (temporary / MADE).write_text(canonical_json(record) + "\n", encoding="utf-8")
         swap(temporary, folder, made_here)
+    except OSError as error:  # a full disk is reported without a name, or with the temporary one
+        name = str(error.filename or temporary).replace(str(temporary), str(folder), 1)
+        raise OSError(error.errno, error.strerror or str(error), name) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

@@ -53,8 +53,12 @@ class Log:
         """
         self.folder, self.total = folder, total
         self.file = None if folder is None else _continued(folder / "metrics.jsonl", step)
-        self.board = None if folder is None else _board(folder / "tensorboard", step)
         self.hook, threading.excepthook = threading.excepthook, self._of_thread
+        try:
+            self.board = None if folder is None else _board(folder / "tensorboard", step)
+        except BaseException:
+            threading.excepthook = self.hook
+            raise
         self.sums: dict[str, Tensor] = {}
         self.count = 0
         self.rate = 0.0
@@ -155,7 +159,8 @@ def _board(folder: Path, step: int) -> Any:  # noqa: ANN401 - None, or a writer 
         return None
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(folder), purge_step=step or None)
+    with _named(folder):
+        return SummaryWriter(str(folder), purge_step=step or None)
 
 
 BAD_BATCH = "bad-batch.safetensors"
