@@ -33,6 +33,14 @@ FLAGS: dict[str, list[str]] = {
     ],
     "icp": ["--templates", "2", "--states", "1", "--part-points", "80", "--starts", "4"],
     "kiss-matcher": ["--templates", "2", "--states", "1", "--part-points", "80"],
+    "pointnet2": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--centres", "16", "4", "--whole-widths", "32", "32",
+    ],
+    "gcn3d": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4",
+        "--widths", "8", "8", "16", "16", "32", "--fuse", "32", "32",
+    ],
     "eap": [
         "--preset", "cpu", "--epochs", "1", "1", "--batch", "4", "--points", "32",
         "--encoder.channels", "4", "8", "--encoder.radii", "0.2", "0.3",
@@ -64,10 +72,17 @@ POINTS = 160
 """Of each cloud."""
 
 
-def hinged_data(folder: Path, *, train: int = 12, test: int = 5, color: bool = False) -> Path:
-    """A train and a test split of two plates that turn, as laptops; colours come with sensors."""
+def hinged_data(
+    folder: Path, *, train: int = 12, test: int = 5, color: bool = False, wrong: bool = False
+) -> Path:
+    """A train and a test split of two plates that turn, as laptops; colours come with sensors.
+
+    `wrong`: labels of other clouds.
+    """
     for split, count in (("train", train), ("test", test)):
         observation, labels = plates(count, POINTS, seed=count)
+        if wrong:
+            _, labels = plates(count, POINTS, seed=count + 100)
         assert labels.camera_T_part is not None
         assert labels.joints is not None
         assert labels.part is not None
