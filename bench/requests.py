@@ -17,7 +17,7 @@ import tyro
 from bench.matching import LabelOrder
 from bench.metrics import ApRule, IouKind, PivotKind, RotationKind
 
-Mode = Literal["fast", "refine"]
+Mode = Literal["fast", "quick", "refine"]
 """`scapo.method.Mode`, written out: that module loads torch."""
 Precision = Literal["float32", "bfloat16", "float16"]
 """`scapo.training.precision.Precision`, likewise."""
@@ -94,7 +94,7 @@ class PredictRequest(RunRequest):
     split: str = "test"
     """Split to predict."""
     mode: Mode = "fast"
-    """fast: networks only; refine: with optimisation at test time."""
+    """fast: networks only; refine: with optimisation at test time; quick: with a little of it."""
     oracle: bool = False
     """Show a method that can use them true labels of the test split (icp: the parts); the
     variant then begins with oracle."""
@@ -115,8 +115,8 @@ class StabilityRequest(RunRequest):
     """Report, FILE.json."""
     split: str = "test"
     """Split whose clouds are used, without labels."""
-    mode: Literal["fast", "refine", "both"] = "both"
-    """Inference modes to measure."""
+    mode: Literal["fast", "quick", "refine", "both"] = "both"
+    """Inference modes to measure; both: fast and refine."""
     samples: int = 20
     """Clouds, evenly spread over the split."""
     motions: int = 2
@@ -163,8 +163,8 @@ class StudyRequest:
     """Folder for predictions/, scores/, ladders/, pictures/, stability/ and README.md."""
     split: str = "test"
     """Split to score."""
-    mode: Literal["fast", "refine", "both"] = "both"
-    """Inference modes to study."""
+    mode: Literal["fast", "quick", "refine", "both"] = "both"
+    """Inference modes to study; both: fast and refine."""
     calibration: int = 500
     """Training clouds that fix the frames of a method that saw no poses."""
     samples: int = 20
