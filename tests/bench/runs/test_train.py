@@ -22,6 +22,7 @@ from scapo.store.files import read, read_header
 from scapo.store.schema import StoreError
 from scapo.types import Prediction
 from tests.helpers.hinged import plates
+from tests.helpers.small import FLAGS
 from tests.helpers.splits import write_split
 
 SMALL = [
@@ -125,12 +126,13 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
 
 def test_icp_with_and_without_its_oracle(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "icp"
-    command("train", "icp", "--category", "laptop", "--data", data, "--out", run, "--templates", 2)
+    command("train", "icp", "--category", "laptop", "--data", data, "--out", run, *FLAGS["icp"])
     for words, variant in (((), ""), (("--oracle",), "oracle-segmentation")):
         out = tmp_path / f"{variant}p.safetensors"
         command("predict", run, "--data", data, "--out", out, *words)
         header = read_prediction_header(out)
-        assert (header.variant, header.supervision) == (variant, ("pose", "segmentation"))
+        assert header.variant == variant
+        assert header.supervision == ("instance", "joint", "pose", "segmentation")
     assert (run / "metrics.jsonl").read_text() == ""
 
 
