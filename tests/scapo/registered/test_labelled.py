@@ -187,10 +187,10 @@ def test_a_stored_one_answers_alike(made: LabelledRegistered) -> None:
 
 @pytest.mark.slow
 def test_the_bound_explains_the_views_at_least_as_well_as_what_is_discovered() -> None:
-    seen = objects(8, 5, seed=6)
+    seen = objects(6, 4, seed=6)
     discovery = DiscoveryConfig(
-        seeds=16, rotations=200, searched=20, trusted=(0.9,), starts=1, draws=1, heats=(),
-        judged=4, template_points=150, final_points=300, leans=False,
+        seeds=10, rotations=200, searched=12, trusted=(0.9,), starts=1, draws=1, heats=(),
+        judged=4, template_points=120, final_points=300, mirror=False, leans=False,
     )  # fmt: skip
     config = RegisteredConfig(discovery=discovery, points=128, width=8, epochs=1)
     found = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
