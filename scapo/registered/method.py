@@ -17,7 +17,7 @@ it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import torch
@@ -58,7 +58,7 @@ from scapo.registered.pose_search import (
     modes_of,
     most_confident,
     refine_states,
-    search,
+    successive_halving,
 )
 from scapo.registered.pseudo_labels import PseudoLabels
 from scapo.registered.template import (
@@ -102,8 +102,8 @@ class SearchConfig:
     points: int = 256
     """Points of each cloud that the network and the search see."""
     grid_hypotheses: int = 32
-    """Placements of each cloud that `refine` begins with, at least 1: half of them as of clouds
-    that look alike and were placed in training, half as of pictures of the template."""
+    """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
+    and were placed in training, half as of images of the template; 0: the network's four."""
     quick_hypotheses: int = 12
     """The same for `quick`."""
     strays: Literal["out", "kept"] = "out"
@@ -112,12 +112,6 @@ class SearchConfig:
     """Try all states again for the placement that won."""
     camera: Literal["known", "estimated"] = "known"
     """Whether `quick` and `refine` take the camera from the cloud's frame or from the network."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError where nothing would be tried."""
-        for name in ("grid_hypotheses", "quick_hypotheses"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected at least 1, found {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -392,12 +386,11 @@ class AbstractRegistered(AbstractMethod):
         turn with it.
         """
         space, quick = self._space()[0], mode == "quick"
-        effort = (
-            replace(BRIEF, proposed=self.config.quick_hypotheses)
-            if quick
-            else replace(THOROUGH, proposed=self.config.grid_hypotheses)
-        )
-        found = search(self.template, views, space, effort).best(self._limits().wider(CHARGED))
+        effort = BRIEF if quick else THOROUGH
+        count = self.config.quick_hypotheses if quick else self.config.grid_hypotheses
+        start = space.propose(views, count) if count else self._hypotheses(views.points)[0]
+        left = successive_halving(self.template, views, start, space, effort)
+        found = left.best(self._limits().wider(CHARGED))
         final = found.placement
         if self.config.settle and not quick:
             final = refine_states(self.template, views, found, self._limits())

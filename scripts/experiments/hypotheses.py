@@ -31,8 +31,8 @@ from scapo.store import open_split
 from scapo.store.samples import SampleDataset, label, observe
 from scapo.types import Labels, Observation, Prediction
 
-COUNTS = (1, 2, 4, 8, 12, 16, 32, 64)
-CALIBRATED = 100
+COUNTS = (1, 4, 12, 32, 64)
+CALIBRATED = 50
 """Training clouds that the frames are calibrated on."""
 BATCH = 32
 RIGHT, TURNED = 30.0, 150.0
