@@ -19,12 +19,17 @@ from bench.scoring.compat_files import Canon, check_record, fit_canon, score_com
 from bench.scoring.predictions import Header, Predictions, read_prediction_header
 from bench.scoring.score_files import Run, side_file, writing
 from bench.scoring.scores import Errors, Frames, Rows, score
-from bench.scoring.summary import summarise
+from bench.scoring.summary import by_trait, summarise
 from bench.scoring.truth import Truth, blocks, revolute, symmetry
 from bench.statistics import BOOTSTRAP_SEED
 from scapo.store import Split, StoreError, open_split, sha256_file
 from scapo.store.provenance import commit, machine
 from scapo.text import one_line
+
+PARTS = ("clean", "complete", "isolated", "sensor", "real")
+"""Folders above the categories that say what the data are."""
+PROTOCOLS = {"full": "complete", "isolated": "isolated"}
+"""How the clouds were taken -> the part that such data belong to."""
 
 
 def evaluate(request: Request) -> dict[str, Any]:
@@ -99,8 +104,8 @@ def data_name(folder: Path, split: Split) -> str:
     """`NAME@DIGEST`: what the data are called, and the first 12 digits of their digest.
 
     NAME is the manifest's option `benchmark`, else the folder above the category where that is
-    part of the data set or of the benchmark (`clean`, `sensor`, `complete`, `real`), else `sensor`
-    for data with simulated sensor noise and `clean` without.
+    part of the data set or of the benchmark (`PARTS`), else `complete` for whole surfaces,
+    `isolated` for parts rendered alone, `sensor` for data with sensor noise, `clean` without.
     """
     manifest, root = split.manifest, folder.resolve()
     named = manifest.options.get("benchmark")
@@ -108,8 +113,10 @@ def data_name(folder: Path, split: Split) -> str:
     inside = above != root and above.is_relative_to(root)
     if isinstance(named, str) and named:
         name = one_line(named, 100)
-    elif inside or above.name in ("clean", "sensor", "complete", "real"):
+    elif inside or above.name in PARTS:
         name = above.name
+    elif (protocol := str(manifest.options.get("protocol"))) in PROTOCOLS:
+        name = PROTOCOLS[protocol]
     else:
         noisy = manifest.options.get("noise", "none") != "none"
         name = "sensor" if noisy else "clean"
@@ -127,6 +134,7 @@ def _report(
     errors = scored.joined()
     instance = np.concatenate(scored.instance) if scored.instance else np.zeros(0, np.int64)
     run = run_of(request, header, split)
+    trait = [thing.trait for thing in split.manifest.instances]
     return {
         **{name: getattr(run, name) for name in Run.__slots__},
         "supervision": list(header.supervision),
@@ -151,7 +159,10 @@ def _report(
             "predictions": sha256_file(request.predictions),
         },
         **_origin(header),
+        "camera": header.camera,
         "instance": instance.tolist(),
+        "trait": trait if any(trait) else [],
+        "by_trait": by_trait(errors, instance, trait, request.settings.ap_rule),
         **summarise(errors, instance, request.settings.ap_rule),
     }
 
