@@ -73,8 +73,9 @@ def _search(
     return torch.cat([empty, *rows]).reshape(*source.shape[:-1], k)
 
 
-BLOCK = 1 << 19
-"""Scores held at a time on the CPU: 2 MiB in float32, about a core's cache."""
+BLOCK = 1 << 15
+"""Scores held at a time on the CPU: 128 KiB in float32. More leave a core's own cache, which costs
+several times as long where others compute beside it; the results do not depend on it."""
 
 
 def _products(
@@ -83,7 +84,7 @@ def _products(
     """The product left @ right, in order, as many clouds, or rows of one, at a time as fit."""
     n, m = left.shape[1], right.shape[2]
     on_cpu = left.device.type == "cpu"
-    block = BLOCK if on_cpu else 128 * BLOCK
+    block = BLOCK if on_cpu else 2048 * BLOCK
     clouds, rows = max(1, block // max(1, n * m)), max(1, block // m)
     with exact(left.device.type):  # fewer digits would find the wrong neighbours
         for some, others in zip(left.split(clouds), right.split(clouds), strict=True):
