@@ -20,7 +20,11 @@ METHODS: dict[str, Method] = {
     **LIBRARY,
     "icp": Method(title="ICP", rank=40, maker="bench.baselines.icp:Icp",
                   presets={"paper": "bench.baselines.icp:IcpConfig"},
-                  supervision=("segmentation", "pose")),
+                  supervision=("segmentation", "pose", "joint", "instance")),
+    "kiss-matcher": Method(title="KISS-Matcher, then ICP", rank=41,
+                           maker="bench.baselines.kiss_matcher:KissMatcher",
+                           presets={"cpu": "bench.baselines.kiss_matcher:KissMatcherConfig"},
+                           supervision=("segmentation", "pose", "joint", "instance")),
 }  # fmt: skip
 
 

@@ -43,7 +43,7 @@ class Method:
     """Configurations by name, each what makes it or `module:name` of that; the first is the
     default of the command line."""
     supervision: tuple[str, ...] = ()
-    """Labels that it uses unless told otherwise: pose, segmentation, joint."""
+    """Labels that it uses unless told otherwise: pose, segmentation, joint, instance."""
     camera: bool = False
     """Whether it uses the camera's position."""
 
@@ -82,6 +82,14 @@ LIBRARY: dict[str, Method] = {
         rank=80,
         maker="scapo.registered.method:RegisteredScapo",
         presets={"cpu": "scapo.registered.method:cpu_config"},
+        camera=True,
+    ),
+    "registered-labelled": Method(
+        title="SCAPO, registered, true template",
+        rank=81,
+        maker="scapo.registered.labelled:LabelledRegistered",
+        presets={"cpu": "scapo.registered.labelled:LabelledConfig"},
+        supervision=("segmentation", "pose", "joint", "instance"),
         camera=True,
     ),
 }

@@ -14,7 +14,8 @@ from typing import Literal
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Supervision = Literal["pose", "segmentation", "joint"]
+Supervision = Literal["pose", "segmentation", "joint", "instance"]
+"""Kinds of ground truth that a method may be given, each a field of `Labels`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +52,8 @@ class Labels:
     camera_T_part: Float[Tensor, "*B P 4 4"] | None = None
     joints: Joints | None = None
     """Camera frame."""
+    instance: Int[Tensor, "*B"] | None = None
+    """Which object each cloud shows, as numbered in its data set."""
 
     def keep(self, supervision: frozenset[Supervision]) -> Labels:
         """The labels that a method with this supervision may see; all else is None."""
@@ -58,6 +61,7 @@ class Labels:
             part=self.part if "segmentation" in supervision else None,
             camera_T_part=self.camera_T_part if "pose" in supervision else None,
             joints=self.joints if "joint" in supervision else None,
+            instance=self.instance if "instance" in supervision else None,
         )
 
 

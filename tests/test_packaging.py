@@ -16,7 +16,7 @@ from sim_assets.rendering.doctor import PACKAGES
 
 tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
-EXTRAS = {"sim", "gpu-sim", "bench", "view", "export", "cluster", "all"}
+EXTRAS = {"sim", "gpu-sim", "bench", "view", "export", "cluster", "kiss-matcher", "all"}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_console_scripts_refuse_unknown_words(script: str):
 def test_all_is_the_union_of_the_extras(pyproject: dict[str, Any]):
     extras = pyproject["project"]["optional-dependencies"]
     assert set(extras) == EXTRAS
-    assert extras["all"] == ["scapo[sim,gpu-sim,bench,view,export,cluster]"]
+    assert extras["all"] == ["scapo[sim,gpu-sim,bench,view,export,cluster,kiss-matcher]"]
 
 
 def test_doctor_lists_what_the_extras_bring(pyproject: dict[str, Any]):
@@ -86,7 +86,7 @@ def test_the_version_is_the_same_everywhere(repository: Path, pyproject: dict[st
     ("lock", "extras"),
     [
         ("requirements.lock", ("sim", "bench", "view")),
-        ("requirements-all.lock", ("sim", "bench", "view", "gpu-sim", "cluster")),
+        ("requirements-all.lock", ("sim", "bench", "view", "gpu-sim", "cluster", "kiss-matcher")),
     ],
 )
 def test_the_lock_covers_what_is_declared(

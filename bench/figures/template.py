@@ -34,7 +34,7 @@ from scapo.method import AbstractMethod
 
 if TYPE_CHECKING:
     from scapo.paper.method import Scapo
-    from scapo.registered.method import RegisteredScapo
+    from scapo.registered.method import AbstractRegistered
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,17 +52,17 @@ class TemplateShape:
 def template_shape(method: AbstractMethod) -> TemplateShape | None:
     """The template at the states that the method calls 0; None for a method without one."""
     from scapo.paper.method import Scapo
-    from scapo.registered.method import RegisteredScapo
+    from scapo.registered.method import AbstractRegistered
 
     with torch.no_grad():
-        if isinstance(method, RegisteredScapo):
+        if isinstance(method, AbstractRegistered):
             return _registered(method)
         if isinstance(method, Scapo):
             return _scapo(method)
     return None
 
 
-def _registered(method: RegisteredScapo) -> TemplateShape:
+def _registered(method: AbstractRegistered) -> TemplateShape:
     from scapo.registered.template import Placement
 
     template = method.template

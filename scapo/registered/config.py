@@ -12,15 +12,30 @@ LEAST_ROTATIONS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DiscoveryConfig:
+class TemplateConfig:
+    """How dense a template is, and over what it is searched for."""
+
+    rotations: int = 1000
+    """Rotations of the grid that registration and search try, at least 200."""
+    final_points: int = 1600
+    """Points of the template that is found; its parts end as sharply as it is dense."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a grid too coarse to rank its rotations."""
+        if self.rotations < LEAST_ROTATIONS:
+            raise ValueError(
+                f"rotations: expected at least {LEAST_ROTATIONS}, found {self.rotations}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiscoveryConfig(TemplateConfig):
     """How the template is found, and how much is tried; times are of one CPU core."""
 
     seeds: int = 72
     """Views registered with one another in each draw, 10 ms a pair."""
     agreeing: float = 0.4
     """Share of the registered views, the most confident, that the first fit uses."""
-    rotations: int = 1000
-    """Rotations of the grid that registration and search try, at least 200."""
     searched: int = 144
     """Views that the rounds of search and fit use, 0.2 s each and round."""
     trusted: tuple[float, ...] = (0.55, 0.7, 0.85)
@@ -53,12 +68,3 @@ class DiscoveryConfig:
     """Try whether the axes of hinges deviate from one object to the next."""
     template_points: int = 400
     """Points of the template while it is sought."""
-    final_points: int = 1600
-    """Points of the template that is found; its parts end as sharply as it is dense."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for a grid too coarse to rank its rotations."""
-        if self.rotations < LEAST_ROTATIONS:
-            raise ValueError(
-                f"rotations: expected at least {LEAST_ROTATIONS}, found {self.rotations}"
-            )

@@ -15,6 +15,7 @@ network believes it.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -30,9 +31,9 @@ from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, chan
 from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
-from scapo.registered.config import DiscoveryConfig
+from scapo.registered.config import DiscoveryConfig, TemplateConfig
 from scapo.registered.decode import nearest_weights, placed_prediction
-from scapo.registered.discovery import discover
+from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.network import (
@@ -77,11 +78,11 @@ FRAMES = 4  # Hypotheses of the network for each cloud, one in each of its princ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RegisteredConfig:
-    """SCAPO by registration and bundle adjustment."""
+class SearchConfig:
+    """A template, the network that votes for its placement, and the search at test time."""
 
-    discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    """The search for the template."""
+    discovery: TemplateConfig = field(default_factory=TemplateConfig)
+    """The template."""
     learned: int = 600
     """Training clouds whose placements the network learns, 0.25 s each on one core."""
     trusted: float = 0.85
@@ -106,21 +107,41 @@ class RegisteredConfig:
     """Whether `refine` takes the camera from the cloud's frame or from the network."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisteredConfig(SearchConfig):
+    """SCAPO by registration and bundle adjustment."""
+
+    discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
+    """The search for the template."""
+
+
 def cpu_config() -> RegisteredConfig:
     """Trains one category in at most 20 minutes on two cores."""
     return RegisteredConfig()
 
 
-class RegisteredScapo(AbstractMethod):
-    """The articulated template, the network that votes for its placement, and their training."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedClouds:
+    """The training clouds whose placements the network learns."""
 
-    name: ClassVar[str] = "registered"
+    index: Int[Tensor, " K"]
+    """Rows of all training clouds."""
+    similarity: Similarity
+    """Their normalisation."""
+    views: PartialViews
+
+
+class AbstractRegistered(AbstractMethod):
+    """An articulated template, the network that votes for its placement, and their training.
+
+    Where the template comes from, and what its placements say of part frames, is left open.
+    """
+
     networks: ClassVar[tuple[str, ...]] = ("network",)
     least_points = NEIGHBOURS
-    supervision: frozenset[Supervision] = frozenset()
 
     def __init__(
-        self, config: RegisteredConfig, category: Category, generator: torch.Generator
+        self, config: SearchConfig, category: Category, generator: torch.Generator
     ) -> None:
         super().__init__()
         self.config, self.category = config, category
@@ -137,7 +158,7 @@ class RegisteredScapo(AbstractMethod):
     @property
     def variant(self) -> str:
         """Options that differ from the default, but for how much is trained."""
-        return " ".join(changes(self.config, RegisteredConfig(), leave=("lr",)))
+        return " ".join(changes(self.config, type(self.config)(), leave=("lr",)))
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's; the template is found before it starts."""
@@ -156,7 +177,7 @@ class RegisteredScapo(AbstractMethod):
         self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
     ) -> None:
         """Find the template, and its placement in the clouds that the network will learn."""
-        del stage, labels
+        del stage
         if len(observation.points) < LEAST_CLOUDS:
             raise ValueError(
                 f"training data: expected at least {LEAST_CLOUDS} clouds, "
@@ -171,16 +192,39 @@ class RegisteredScapo(AbstractMethod):
         device = self.template.points.device
         self.template.cpu()  # many small steps, view by view: no work for a GPU
         seed = torch.randint(2**31, (1,), generator=generator, device=generator.device)
-        made = discover(
-            views,
-            self.template.kinds,
-            self.config.discovery,
-            torch.Generator().manual_seed(int(seed)),
-        )
+        learned = LearnedClouds(index=index, similarity=similarity, views=views)
+        made = self._found(learned, observation, labels, torch.Generator().manual_seed(int(seed)))
         self.template.load_state_dict(made.template.state_dict())
         self._set_pseudo_labels(cloud[:, 0], views, made.found)
         self.pseudo.belonging = inlier
         self.to(device)
+
+    @abstractmethod
+    def _found(
+        self,
+        learned: LearnedClouds,
+        observation: Observation,
+        labels: Labels,
+        generator: torch.Generator,
+    ) -> Discovery:
+        """The template, and its placement in the learned clouds; on the host.
+
+        Args:
+            learned: Those clouds.
+            observation: All training clouds.
+            labels: Of all, as allowed by `supervision`.
+            generator: On the host.
+        """
+
+    @abstractmethod
+    def _prediction(
+        self,
+        placement: Placement,
+        part_weight: Float[Tensor, "B N P"],
+        similarity: Similarity,
+        confidence: Float[Tensor, " B"],
+    ) -> Prediction:
+        """What a placement in normalised frames stands for."""
 
     def _inlier_mask(self, cloud: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
         """Which points belong to the object; all where outliers are kept."""
@@ -283,7 +327,7 @@ class RegisteredScapo(AbstractMethod):
 
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
-        """Parts, poses and joints; part frames sit at the middle of the template's base."""
+        """Parts, poses and joints."""
         cloud = observation.points.to(self.template.points)
         clean, similarity = normalise(replaced(cloud, self._inlier_mask(cloud)))
         points, kept = similarity.forward(cloud), self._thinned(clean)
@@ -301,7 +345,7 @@ class RegisteredScapo(AbstractMethod):
             frame = principal_frames(kept)[every, best]
             chosen, confidence = self._refined(clean, camera, frame, placement)
             weight = nearest_weights(self.template, points, chosen, camera)
-        return placed_prediction(self.template, chosen, weight, similarity, confidence)
+        return self._prediction(chosen, weight, similarity, confidence)
 
     def _camera(
         self, observation: Observation, similarity: Similarity, placement: Placement, vote: Tensor
@@ -353,3 +397,31 @@ class RegisteredScapo(AbstractMethod):
             cameras=F.normalize(self.pseudo.camera[learned], dim=-1),
             keep=self.config.grid_hypotheses,
         )
+
+
+class RegisteredScapo(AbstractRegistered):
+    """SCAPO for partial views: the template is discovered, without labels."""
+
+    name: ClassVar[str] = "registered"
+    supervision: frozenset[Supervision] = frozenset()
+
+    def _found(
+        self,
+        learned: LearnedClouds,
+        observation: Observation,
+        labels: Labels,
+        generator: torch.Generator,
+    ) -> Discovery:
+        """By registration and bundle adjustment of the views."""
+        del observation, labels
+        return discover(learned.views, self.template.kinds, self.config.discovery, generator)
+
+    def _prediction(
+        self,
+        placement: Placement,
+        part_weight: Float[Tensor, "B N P"],
+        similarity: Similarity,
+        confidence: Float[Tensor, " B"],
+    ) -> Prediction:
+        """Part frames sit at the middle of the template's base."""
+        return placed_prediction(self.template, placement, part_weight, similarity, confidence)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from scapo.geometry.points import gather
@@ -100,112 +100,172 @@ def refine_gauss_newton(
         start: Placements, one of each view.
         options: Steps and weights.
     """
-    placement = start
+    placement, skin = start, Skin.of(template)
     every = max(1, len(template.points) // options.template_points)
     some = torch.arange(0, len(template.points), every, device=template.points.device)
-    view_points = views.points[:, : options.points]
-    view_normals = views.normals[:, : options.points]
+    points, normals = views.points[:, : options.points], views.normals[:, : options.points]
+    count = points.shape[1]
     for sharpness in sharpened(SHARPNESS, options.steps):
-        points, normals = template.place(placement)
-        match = oriented_nearest(view_points, view_normals, points, normals)
-        back_points, back_normals = points[:, some], normals[:, some]
-        back = oriented_nearest(back_points, back_normals, view_points, view_normals)
-        placed = _place(template, placement, torch.cat([match, some.expand(len(back), -1)], 1))
-        target = torch.cat([view_points, gather(view_points, back)], 1)
-        normal = torch.cat([view_normals, gather(view_normals, back)], 1)
-        off = placed.points - target
-        count = view_points.shape[1]
-        cosine = (placed.normals[:, :count] * view_normals).sum(-1)
+        motion = Motion.of(template, placement)
+        placed, placed_normals = motion.place(skin)
+        match = oriented_nearest(points, normals, placed, placed_normals)
+        back_points, back_normals = placed[:, some], placed_normals[:, some]
+        back = oriented_nearest(back_points, back_normals, points, normals)
+        index = torch.cat([match, some.expand(len(back), -1)], 1)
+        target = torch.cat([points, gather(points, back)], 1)
+        normal = torch.cat([normals, gather(normals, back)], 1)
+        off = gather(placed, index) - target
+        cosine = (gather(placed_normals, match) * normals).sum(-1)
         near = match_weight(off.square().sum(-1), sharpness)
         there = near[:, :count] * normal_weight(cosine) / count
         missed = near[:, count:] * should_be_seen(views, back_points, back_normals) / len(some)
         weight = sharpness * torch.cat([there, missed], 1)
-        placement = _step(template, placement, placed.jacobian, (off, normal, weight))
+        system, gradient = _normal_equations(skin.points[index], motion, (off, normal, weight))
+        placement = _step(template, placement, system, gradient)
     return placement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Placed:
-    """Template points in H views, with what each coordinate of the placement moves them by."""
+class Skin:
+    """A template's points as its part motions act on them: coordinates times each part's share."""
 
-    points: Float[Tensor, "H M 3"]
-    normals: Float[Tensor, "H M 3"]
-    jacobian: Float[Tensor, "H M D 3"]
+    points: Float[Tensor, "M Q"]
+    """Q = 4 P: (x, y, z, 1) times the weight of part 0, then of part 1, ..."""
+    normals: Float[Tensor, "M R"]
+    """R = 3 P: the same of the normals."""
+
+    @staticmethod
+    def of(template: ArticulatedTemplate) -> Skin:
+        """Of a template."""
+        share = template.logit.softmax(-1)[:, :, None]
+        whole = F.pad(template.points, (0, 1), value=1.0)
+        return Skin(
+            points=(share * whole[:, None]).flatten(1),
+            normals=(share * template.normals[:, None]).flatten(1),
+        )
 
 
-def _place(
-    template: ArticulatedTemplate, placement: Placement, index: Int[Tensor, "H M"]
-) -> _Placed:
-    """Chosen template points of every placement, and their derivatives.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """Affine motions of all parts in H views, and what the coordinates of a placement change.
 
-    Columns: turn about the placement's origin (view axes), translation, log scales, states, shifts.
+    A part's point is affine in the template's (`Skin`), so is what any coordinate moves it by. The
+    D coordinates: turn about the placement's origin (view axes), translation, log scales, states,
+    shifts of sliding joints.
     """
-    poses, weight = template.part_poses(placement), template.logit.softmax(-1)[index]
-    scale, turn = placement.log_scale.exp(), placement.rotation
-    scaled = template.points[index] * scale[:, None]
-    points, normals = torch.zeros_like(scaled), torch.zeros_like(scaled)
-    by_scale = scaled.new_zeros(*scaled.shape, 3)  # (H, M, 3 scales, 3)
-    by_state, by_shift = [], []
-    for p in range(weight.shape[-1]):
-        share, rotation = weight[..., p : p + 1], poses.rotation[:, p]
-        part = scaled @ rotation.mT + poses.translation[:, p, None]
-        points = points + share * part
-        normals = normals + share * (template.normals[index] @ rotation.mT)
-        arm = scaled
-        if p:
-            pivot = template.pivot[p - 1] * scale  # the pivot grows with the body
-            arm = scaled - pivot[:, None]
-            by_scale = by_scale + share[..., None] * (pivot[:, None, :, None] * turn.mT[:, None])
-            state, shift = _joint_columns(template, placement, p - 1, part)
-            by_state.append((share * state)[:, :, None])
-            by_shift += [share[..., None] * shift] if template.kinds[p - 1] == "prismatic" else []
-        by_scale = by_scale + share[..., None] * (arm[..., None] * rotation.mT[:, None])
-    eye = torch.eye(3).to(points).expand(*points.shape, 3)
-    turned = by_turn(points - placement.translation[:, None])
-    jacobian = torch.cat([turned, eye, by_scale, *by_state, *by_shift], 2)
-    return _Placed(points=points, normals=F.normalize(normals, dim=-1), jacobian=jacobian)
+
+    affine: Float[Tensor, "H Q 3"]
+    turn: Float[Tensor, "H R 3"]
+    """Of normals."""
+    jacobian: Float[Tensor, "H Q 3 D"]
+    """Of `affine`."""
+
+    @staticmethod
+    def of(template: ArticulatedTemplate, placement: Placement) -> Motion:
+        """Of H placements."""
+        poses, scale = template.part_poses(placement), placement.log_scale.exp()
+        linear = poses.rotation * scale[:, None, None]  # (H, P, 3, 3)
+        affine = torch.cat([linear, poses.translation[..., None]], -1).mT  # (H, P, 4, 3)
+        columns = [_base_columns(template, placement, affine)]
+        joints = range(len(template.kinds))
+        columns += [_state_column(template, placement, j, affine) for j in joints]
+        columns += [
+            _shift_columns(template, placement, j, affine)
+            for j in joints
+            if template.kinds[j] == "prismatic"
+        ]
+        return Motion(
+            affine=affine.flatten(1, 2),
+            turn=poses.rotation.mT.flatten(1, 2),
+            jacobian=torch.cat(columns, -1).flatten(1, 2),
+        )
+
+    def place(self, skin: Skin) -> tuple[Float[Tensor, "H M 3"], Float[Tensor, "H M 3"]]:
+        """Points and unit normals of the template, as `ArticulatedTemplate.place` has them."""
+        return skin.points @ self.affine, F.normalize(skin.normals @ self.turn, dim=-1)
 
 
-def _joint_columns(
-    template: ArticulatedTemplate, placement: Placement, j: int, points: Float[Tensor, "H M 3"]
-) -> tuple[Float[Tensor, "H M 3"], Float[Tensor, "H 1 3 3"]]:
-    """What the state of joint j, and its place across the axis, move its part's points by."""
-    turn, axis = placement.rotation, template.directions()[j]
+def _base_columns(
+    template: ArticulatedTemplate, placement: Placement, affine: Float[Tensor, "H P 4 3"]
+) -> Float[Tensor, "H P 4 3 9"]:
+    """What turn, translation and log scales change of the parts' motions."""
+    arm = affine.clone()
+    arm[:, :, 3] -= placement.translation[:, None]
+    turned = by_turn(arm.flatten(1, 2)).unflatten(1, arm.shape[1:3]).mT
+    moved = torch.zeros_like(turned)
+    moved[:, :, 3] = torch.eye(3).to(arm)
+    scaled = torch.zeros_like(turned)
+    for axis in range(3):
+        scaled[:, :, axis, :, axis] = affine[:, :, axis]
+        for p, pivot in enumerate(template.pivot, 1):  # the pivot grows with the body
+            gap = affine[:, 0, axis] - affine[:, p, axis]
+            scaled[:, p, 3, :, axis] = gap * pivot[axis]
+    return torch.cat([turned, moved, scaled], -1)
+
+
+def _state_column(
+    template: ArticulatedTemplate, placement: Placement, j: int, affine: Float[Tensor, "H P 4 3"]
+) -> Float[Tensor, "H P 4 3 1"]:
+    """What the state of joint j changes."""
+    column = torch.zeros_like(affine)
     own = template.own_directions(placement)[:, j, :, None]
-    way = (turn @ own)[..., 0][:, None].expand_as(points)
-    across = torch.eye(3).to(axis) - axis[:, None] * axis
-    shift = (turn @ across).mT[:, None]
+    way = (placement.rotation @ own)[..., 0]
     if template.kinds[j] == "prismatic":
-        return way, shift
+        column[:, j + 1, 3] = way
+        return column[..., None]
     pivot = template.pivot[j] * placement.log_scale.exp() + placement.shift[:, j]
-    spot = (turn @ pivot[..., None])[..., 0] + placement.translation
-    return torch.linalg.cross(way, points - spot[:, None]), shift
+    arm = affine[:, j + 1].clone()
+    arm[:, 3] -= (placement.rotation @ pivot[..., None])[..., 0] + placement.translation
+    column[:, j + 1] = torch.linalg.cross(way[:, None].expand_as(arm), arm)
+    return column[..., None]
+
+
+def _shift_columns(
+    template: ArticulatedTemplate, placement: Placement, j: int, affine: Float[Tensor, "H P 4 3"]
+) -> Float[Tensor, "H P 4 3 3"]:
+    """What the place of joint j across its axis changes."""
+    axis = template.directions()[j]
+    columns = affine.new_zeros(*affine.shape, 3)
+    columns[:, j + 1, 3] = placement.rotation @ (torch.eye(3).to(axis) - axis[:, None] * axis)
+    return columns
+
+
+def _normal_equations(
+    points: Float[Tensor, "H N Q"],
+    motion: Motion,
+    residual: tuple[Float[Tensor, "H N 3"], Float[Tensor, "H N 3"], Float[Tensor, "H N"]],
+) -> tuple[Float[Tensor, "H D D"], Float[Tensor, "H D"]]:
+    """Of distances across the target's surface, and with weight `ALONG` of all.
+
+    The latter need sums of products of `points` only, not the derivatives of each.
+
+    Args:
+        points: Of the template, as in `Skin`.
+        motion: Where they are.
+        residual: Point minus target, the target's normal, and the weight of the match.
+    """
+    off, normal, weight = residual
+    size = motion.jacobian.shape[-1]
+    weighted = points * weight[..., None]
+    by_normal = (normal[..., None] * points[:, :, None]).flatten(2)  # (H, N, 3 Q)
+    across = by_normal @ motion.jacobian.transpose(1, 2).reshape(len(off), -1, size)
+    system = (across * weight[..., None]).mT @ across
+    gradient = across.mT @ ((off * normal).sum(-1) * weight)[..., None]
+    every = motion.jacobian.flatten(2)  # (H, Q, 3 D)
+    spread = (weighted.mT @ points) @ every
+    along = every.unflatten(2, (3, size)).flatten(1, 2)
+    system = system + ALONG * along.mT @ spread.unflatten(2, (3, size)).flatten(1, 2)
+    gradient = gradient + ALONG * along.mT @ (weighted.mT @ off).flatten(1)[..., None]
+    return system, gradient[..., 0]
 
 
 def _step(
     template: ArticulatedTemplate,
     placement: Placement,
-    jacobian: Float[Tensor, "H N D 3"],
-    residual: tuple[Float[Tensor, "H N 3"], Float[Tensor, "H N 3"], Float[Tensor, "H N"]],
+    system: Float[Tensor, "H D D"],
+    gradient: Float[Tensor, "H D"],
 ) -> Placement:
-    """Solve for one damped step and take it.
-
-    Args:
-        template: For the joints.
-        placement: Where the step starts.
-        jacobian: Of the points.
-        residual: Point minus target, the target's normal, and the weight of the match.
-    """
-    off, normal, weight = residual
-    root = weight.sqrt()
-    across = (jacobian @ (normal * root[..., None])[..., None])[..., 0]  # (H, N, D)
-    along = (jacobian * (ALONG**0.5 * root)[..., None, None]).transpose(2, 3).flatten(1, 2)
-    rows = torch.cat([across, along], 1)
-    right = torch.cat(
-        [(off * normal).sum(-1) * root, (off * (ALONG**0.5 * root)[..., None]).flatten(1)], 1
-    )
-    system = rows.mT @ rows
-    gradient = (rows.mT @ right[..., None])[..., 0]
+    """Solve for one damped step and take it."""
     prior, value = _priors(template, placement)
     gradient = gradient + prior * value
     damping = prior + DAMPING * system.diagonal(dim1=-2, dim2=-1) + LEAST_DAMPING

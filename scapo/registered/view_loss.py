@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.geometry.points import gather
+from scapo.geometry.points import gather, k_nearest
 from scapo.registered.template import oriented
 from scapo.registered.views import PartialViews
 
@@ -61,7 +61,7 @@ def oriented_nearest(
 ) -> Int[Tensor, "B K"]:
     """Nearest target in position and normal: the two faces of a thin plate are told apart."""
     source, goal = oriented(points, normals), oriented(target, target_normals)
-    return (goal.square().sum(-1)[:, None] - 2 * source @ goal.mT).argmin(-1)
+    return k_nearest(source, goal, 1)[..., 0]
 
 
 @torch.no_grad()

@@ -181,6 +181,7 @@ def label(batch: dict[str, Tensor]) -> Labels:
         joints=Joints(
             pivot=batch["joint_pivot"], axis=batch["joint_axis"], state=batch["joint_state"]
         ),
+        instance=batch["instance"],
     )
 
 
@@ -193,8 +194,6 @@ class TrainingData:
     """Only what the method's supervision allows is handed on."""
     digest: str
     """Of the manifest."""
-    instance: Int[Tensor, " B"] | None = None
-    """Which object each cloud shows, where that is known."""
     validation: TrainingData | None = None
     """Clouds that are not trained on."""
 
@@ -220,7 +219,8 @@ class TrainingData:
             ValueError: Nothing would be left.
         """
         count = self.observation.points.shape[0]
-        number = torch.arange(count) if self.instance is None else self.instance
+        instance = self.labels.instance
+        number = torch.arange(count) if instance is None else instance
         which = number.unique(return_inverse=True)[1].to(self.observation.points.device)
         out = which % HELD_OUT == 0
         if bool(out.all()):
@@ -244,5 +244,4 @@ def read_training_data(split: Split) -> TrainingData:
         observation=observe(batch),
         labels=label(batch),
         digest=split.manifest.digest,
-        instance=batch["instance"],
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,18 @@ from tests.helpers.small import FLAGS, hinged_data
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import tiny_data
 
-ALL = tuple(METHODS)
+NEEDS = {"kiss-matcher": "kiss_matcher"}
+"""Packages of methods that no extra for the bench installs."""
+ALL = tuple(
+    pytest.param(
+        name,
+        marks=pytest.mark.skipif(
+            name in NEEDS and find_spec(NEEDS[name]) is None,
+            reason=f"the package {NEEDS.get(name)} is not installed",
+        ),
+    )
+    for name in METHODS
+)
 
 
 def made(name: str, category: str = "laptop", preset: str | None = None) -> AbstractMethod:

@@ -25,7 +25,12 @@ FLAGS: dict[str, list[str]] = {
         "--discovery.no-mirror", "--discovery.no-leans",
         "--discovery.template-points", "60", "--discovery.final-points", "80",
     ],
-    "icp": ["--templates", "2"],
+    "registered-labelled": [
+        "--learned", "8", "--epochs", "1", "--points", "128", "--width", "8",
+        "--grid-hypotheses", "4", "--discovery.rotations", "200", "--discovery.final-points", "80",
+    ],
+    "icp": ["--templates", "2", "--states", "1", "--part-points", "80", "--starts", "4"],
+    "kiss-matcher": ["--templates", "2", "--states", "1", "--part-points", "80"],
 }  # fmt: skip
 
 

@@ -81,7 +81,8 @@ def test_a_model_of_another_package_is_loaded_by_its_name(package: Path) -> None
     found = load(package)
     assert type(found.model) is type(model)
     assert found.predict(np.random.default_rng(0).normal(size=(96, 3))).part_weight.shape == (96, 2)
-    with pytest.raises(StoreError, match="expected a method of scapo, registered, found 'renamed'"):
+    known = "expected a method of scapo, registered, registered-labelled, found 'renamed'"
+    with pytest.raises(StoreError, match=known):
         load_method(package, LIBRARY)
 
 

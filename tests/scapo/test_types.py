@@ -36,6 +36,7 @@ def make_labels(seed: int, *shape: int) -> Labels:
         part=torch.zeros(*shape, 7, dtype=torch.long),
         camera_T_part=rigid_motions(seed, *shape, 3),
         joints=make_joints(seed, *shape, 2),
+        instance=torch.zeros(shape, dtype=torch.long),
     )
 
 
@@ -64,8 +65,9 @@ FIELD_OF: dict[Supervision, str] = {
     "segmentation": "part",
     "pose": "camera_T_part",
     "joint": "joints",
+    "instance": "instance",
 }
-SUBSETS = [frozenset(some) for n in range(4) for some in combinations(FIELD_OF, n)]
+SUBSETS = [frozenset(some) for n in range(5) for some in combinations(FIELD_OF, n)]
 
 
 @pytest.mark.parametrize("supervision", SUBSETS, ids=sorted)

@@ -12,9 +12,10 @@ import torch
 from scapo.categories import JointKind
 from scapo.geometry.rigid import random_rotations, rotation_angle
 from scapo.registered.pose_refinement import (
+    Motion,
+    Skin,
     StepOptions,
     _move,
-    _place,
     refine_gauss_newton,
     search_states,
 )
@@ -47,17 +48,19 @@ def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], aside:
         deviation=aside * torch.randn(3, joints, 3, generator=g).double() * (1 - sliding),
     )
     made.rest.copy_(torch.randn(joints, generator=g))
-    index = torch.arange(20).expand(3, 20)
     with torch.no_grad():
-        jacobian = _place(made, placement, index).jacobian
-        for column in range(jacobian.shape[2]):
-            step = torch.zeros(3, jacobian.shape[2]).double()
+        motion, skin = Motion.of(made, placement), Skin.of(made)
+        for ours, theirs in zip(motion.place(skin), made.place(placement), strict=True):
+            torch.testing.assert_close(ours, theirs)
+        for column in range(motion.jacobian.shape[-1]):
+            step = torch.zeros(3, motion.jacobian.shape[-1]).double()
             step[:, column] = 1e-6
-            after, before = (
-                _place(made, _move(made, placement, sign * step), index).points for sign in (1, -1)
-            )
+            after, before = (made.place(_move(made, placement, sign * step))[0] for sign in (1, -1))
             torch.testing.assert_close(
-                (after - before) / 2e-6, jacobian[:, :, column], atol=1e-6, rtol=1e-5
+                (after - before) / 2e-6,
+                skin.points @ motion.jacobian[..., column],
+                atol=1e-6,
+                rtol=1e-5,
             )
 
 

@@ -134,21 +134,21 @@ def test_the_default_loss_is_the_sum_of_the_terms() -> None:
 def test_objects_are_held_out_whole() -> None:
     data = tiny_data(24)
     instance = torch.arange(24) % 12 * 7
-    split = replace(data, instance=instance).held_out()
+    split = replace(data, labels=replace(data.labels, instance=instance)).held_out()
     assert split.validation is not None
-    assert split.instance is not None
-    assert split.validation.instance is not None
-    assert set(split.validation.instance.tolist()) == {0, 70}
-    assert not set(split.instance.tolist()) & {0, 70}
+    left, held = split.labels.instance, split.validation.labels.instance
+    assert left is not None
+    assert held is not None
+    assert set(held.tolist()) == {0, 70}
+    assert not set(left.tolist()) & {0, 70}
     out = (instance % 70) == 0
     assert torch.equal(split.observation.points, data.observation.points[~out])
     assert torch.equal(split.validation.observation.points, data.observation.points[out])
     assert split.validation.labels.joints is not None
     one = TrainingData(
         observation=take(data.observation, torch.arange(3)),
-        labels=Labels(),
+        labels=Labels(instance=torch.zeros(3, dtype=torch.long)),
         digest="",
-        instance=torch.zeros(3, dtype=torch.long),
     )
     with pytest.raises(ValueError, match="expected an object to train on, and one to hold out"):
         one.held_out()
