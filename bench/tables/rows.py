@@ -230,7 +230,7 @@ def left_out(
 
 
 def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tuple[str, ...]:
-    """One line per run series: seeds, data and what its header says of its cost."""
+    """One line per run series: seeds, data, labels and what its header says of its cost."""
     lines: dict[str, set[int]] = {}
     for run in results.all_runs(unseen=False):
         if (
@@ -242,7 +242,8 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
         name = display_name(series_of(run))
         text = (
             f"{name}, {run.run.category} on {run.run.data} ({run.run.split}), "
-            f"{len(run.samples)} samples; {_cost(run.report)}"
+            f"{len(run.samples)} samples; labels: {', '.join(run.report.supervision) or 'none'}; "
+            f"{_cost(run.report)}"
         )
         lines.setdefault(text, set()).add(run.run.seed)
     return tuple(

@@ -41,11 +41,9 @@ def make_scores(
     with writing(path) as file:
         file.add(run, 0, {key: value[:15] for key, value in errors.items()})
         file.add(run, 15, {key: value[15:] for key, value in errors.items()})
-        file.report = report_of(run, supervision, samples) | {
-            "camera": camera, "trait": list(traits), "by_trait": {},
-        }  # fmt: skip
-        if budget is not None:
-            file.report["budget"] = budget
+        own = {"camera": camera, "trait": list(traits) or None, "budget": budget}
+        known = {name: value for name, value in own.items() if value is not None}
+        file.report = report_of(run, supervision, samples) | known
     return errors
 
 

@@ -112,8 +112,8 @@ def test_what_was_not_run_is_a_dash_and_no_mean_and_an_empty_row_is_one_line(bui
     assert "NPCS-EPN as printed (S); ICP as printed (D, C)" in note
     assert "3DGCN (" not in note.partition("Without a value")[2]
     assert (
-        "SCAPO, laptop on clean@0123456789ab (test), 40 samples; device cpu, batch –, "
-        "seconds per cloud –; budget: seconds 12.5; seeds 1, 2."
+        "SCAPO, laptop on clean@0123456789ab (test), 40 samples; labels: none; device cpu, "
+        "batch –, seconds per cloud –; budget: seconds 12.5; seeds 1, 2."
     ) in text
 
 
