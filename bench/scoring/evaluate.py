@@ -134,7 +134,6 @@ def _report(
     errors = scored.joined()
     instance = np.concatenate(scored.instance) if scored.instance else np.zeros(0, np.int64)
     run = run_of(request, header, split)
-    trait = [thing.trait for thing in split.manifest.instances]
     return {
         **{name: getattr(run, name) for name in Run.__slots__},
         "supervision": list(header.supervision),
@@ -161,9 +160,19 @@ def _report(
         **_origin(header),
         "camera": header.camera,
         "instance": instance.tolist(),
+        **_by_trait(request, split, errors, instance),
+        **summarise(errors, instance, request.settings.ap_rule),
+    }
+
+
+def _by_trait(
+    request: Request, split: Split, errors: Errors, instance: Int[np.ndarray, " B"]
+) -> dict[str, Any]:
+    """What sets each object apart from the training shapes, and the summaries told apart by it."""
+    trait = [thing.trait for thing in split.manifest.instances]
+    return {
         "trait": trait if any(trait) else [],
         "by_trait": by_trait(errors, instance, trait, request.settings.ap_rule),
-        **summarise(errors, instance, request.settings.ap_rule),
     }
 
 

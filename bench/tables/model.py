@@ -72,10 +72,10 @@ class Row:
         return all(cell.value is None for cell in self.cells)
 
     def repeats(self, other: Row) -> bool:
-        """Whether another row of the same source says all that this one does."""
+        """Whether another row of the same source prints all that this one does."""
         pairs = zip(self.cells, other.cells, strict=True)
         return self.source == other.source and all(
-            mine.value is None or mine.value == its.value for mine, its in pairs
+            mine.value is None or mine.shown == its.shown for mine, its in pairs
         )
 
 

@@ -222,7 +222,7 @@ def left_out(
             if row.empty and not row.plain:
                 name = row.method if row.source == "ours" else f"{row.method} as printed"
                 empty.setdefault(name, []).append(symbol)
-    sentences = [f"{what}: {', '.join(words)}." for what, words in missing.items() if words]
+    sentences = [f"{what}: {'; '.join(words)}." for what, words in missing.items() if words]
     if empty:
         told = (f"{name} ({', '.join(symbols)})" for name, symbols in empty.items())
         sentences.append(f"Without a value: {'; '.join(told)}.")
