@@ -18,6 +18,14 @@ if TYPE_CHECKING:
 
 METHODS: dict[str, Method] = {
     **LIBRARY,
+    "gcn3d": Method(title="3DGCN", rank=10, maker="bench.baselines.gcn3d:Gcn3d",
+                    presets={"paper": "bench.baselines.gcn3d:Gcn3dConfig",
+                             "cpu": "bench.baselines.gcn3d:cpu_config"},
+                    supervision=("pose", "segmentation", "joint")),
+    "pointnet2": Method(title="PointNet++", rank=20, maker="bench.baselines.pointnet2:PointNet2",
+                        presets={"paper": "bench.baselines.pointnet2:PointNet2Config",
+                                 "cpu": "bench.baselines.pointnet2:cpu_config"},
+                        supervision=("pose", "segmentation", "joint")),
     "icp": Method(title="ICP", rank=40, maker="bench.baselines.icp:Icp",
                   presets={"paper": "bench.baselines.icp:IcpConfig"},
                   supervision=("segmentation", "pose", "joint", "instance")),
@@ -25,6 +33,12 @@ METHODS: dict[str, Method] = {
                            maker="bench.baselines.kiss_matcher:KissMatcher",
                            presets={"cpu": "bench.baselines.kiss_matcher:KissMatcherConfig"},
                            supervision=("segmentation", "pose", "joint", "instance")),
+    "eap": Method(title="EAP", rank=50, maker="bench.baselines.eap.method:Eap",
+                  presets={"paper": "bench.baselines.eap.method:EapConfig",
+                           "cpu": "bench.baselines.eap.method:cpu_config"}),
+    "op-align": Method(title="OP-Align", rank=60, maker="bench.baselines.op_align.method:OpAlign",
+                       presets={"paper": "bench.baselines.op_align.method:OpAlignConfig",
+                                "cpu": "bench.baselines.op_align.method:cpu_config"}),
 }  # fmt: skip
 
 

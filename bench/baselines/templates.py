@@ -22,8 +22,8 @@ from scapo.geometry.rigid import apply, invert
 from scapo.records import cat, take
 from scapo.types import Labels, Observation
 
-LEAST_POINTS = 10
-"""Points of a part that can be registered, or registered to."""
+LEAST_POINTS = 11
+"""Points of a part that can be registered, or registered to: small_gicp warns of fewer."""
 ROUNDS = 20  # Of k-means over the states
 
 

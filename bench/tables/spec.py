@@ -80,8 +80,6 @@ PUBLISHED = {
     "gcn3d": ("3DGCN", 10),
     "pointnet2": ("PointNet++", 20),
     "npcs-epn": ("NPCS-EPN", 30),
-    "eap": ("EAP", 50),
-    "op-align": ("OP-Align", 60),
 }
 """Methods that are not trained here: name in a predictions file -> what a table calls it, and its
 rank among the methods of `bench.methods`, which say the same of themselves."""

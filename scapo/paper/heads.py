@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
 from scapo.geometry.numerics import at_least_float32
+from scapo.geometry.points import farthest_points, k_means
 from scapo.paper.vector_neurons import uniform
 
 
@@ -217,20 +218,5 @@ def part_centroids(
     points: Float[Tensor, "N 3"], parts: int, rounds: int = 20
 ) -> Float[Tensor, "P 3"]:
     """P-means of a shape, started from its farthest points: where bones can begin."""
-    centroids = _farthest(points, parts)
-    for _ in range(rounds):
-        nearest = torch.cdist(points, centroids).argmin(1)
-        member = F.one_hot(nearest, parts).to(points.dtype)  # (N, P)
-        count = member.sum(0)[:, None]
-        centroids = torch.where(count > 0, member.T @ points / count.clamp(min=1), centroids)
-    return centroids
-
-
-def _farthest(points: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "P 3"]:
-    """Points far from the centroid and from each other."""
-    distance = (points - points.mean(0)).norm(dim=1)
-    chosen = [points[distance.argmax()]]
-    for _ in range(count - 1):
-        apart = torch.cdist(points, torch.stack(chosen)).amin(1)
-        chosen.append(points[apart.argmax()])
-    return torch.stack(chosen)
+    first = int((points - points.mean(0)).norm(dim=1).argmax())
+    return k_means(points, points[farthest_points(points, parts, start=first)], rounds)

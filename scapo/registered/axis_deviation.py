@@ -40,7 +40,7 @@ from scapo.registered.deviation_model import (
     expected_deviations,
     learn_deviations,
 )
-from scapo.registered.gauss_newton import bounded, by_turn, damped_step
+from scapo.registered.gauss_newton import bounded, by_turn, damped_step, point_equations
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.motion_segmentation import rebuild
 from scapo.registered.pose_refinement import StepOptions, refine
@@ -343,14 +343,10 @@ def _turn_onto(
     else:
         nearest = oriented_nearest(*source, arms, normals)
         met, along, sharpness = gather(arms, nearest), ALONG, SHARPNESS
-    off = source[0] - met
+    off = met - source[0]
     weight = mine * match_weight(off.square().sum(-1), sharpness)
-    moved = by_turn(met)
-    across = (moved @ source[1][..., None])[..., 0]
-    gap = (off * source[1]).sum(-1)
-    system = torch.einsum("bki,bkj,bk->bij", across, across, (1 - along) * weight)
-    system = system + torch.einsum("bkic,bkjc,bk->bij", moved, moved, along * weight)
-    right = torch.einsum("bki,bk,bk->bi", across, gap, (1 - along) * weight)
-    right = right + torch.einsum("bkic,bkc,bk->bi", moved, off, along * weight)
-    step = damped_step(system, -right, torch.full_like(right, DAMPING))
+    system, gradient = point_equations(
+        by_turn(met), off, source[1], (1 - along) * weight, along * weight
+    )
+    step = damped_step(system, gradient, torch.full_like(gradient, DAMPING))
     return rotvec_to_rotmat(bounded(step, MOST_TURN)) @ turned

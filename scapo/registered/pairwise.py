@@ -20,7 +20,7 @@ from torch import Tensor
 from scapo.geometry.points import gather
 from scapo.geometry.rotations import rotvec_to_rotmat, unitquat_to_rotmat
 from scapo.records import cat, take
-from scapo.registered.gauss_newton import by_turn, damped_step
+from scapo.registered.gauss_newton import by_turn, damped_step, point_equations
 from scapo.registered.view_loss import match_weight, sharpened
 from scapo.registered.views import TINY, PartialViews
 
@@ -210,16 +210,9 @@ def plane_step(
     Returns:
         Rotation and translation to apply after the present pose, x -> R x + t.
     """
-    residual = moved - target
-    across = torch.cat([torch.linalg.cross(moved, normal), normal], -1)
-    weighted = across * weight[..., None]
-    system = weighted.mT @ across
-    gradient = (weighted * (residual * normal).sum(-1, keepdim=True)).sum(-2)
-    eye = torch.eye(3).to(moved).expand(*moved.shape[:-1], 3, 3)
-    full = torch.cat([by_turn(moved).mT, eye], -1).flatten(-3, -2)  # (B, 3P, 6)
-    spread = weight.repeat_interleave(3, -1)[..., None] * ALONG * full
-    system = system + spread.mT @ full
-    gradient = gradient + (spread * residual.flatten(-2)[..., None]).sum(-2)
+    eye = torch.eye(3).to(moved).expand(*moved.shape, 3)
+    jacobian = torch.cat([by_turn(moved), eye], -1)
+    system, gradient = point_equations(jacobian, moved - target, normal, weight, ALONG * weight)
     damping = DAMPING * system.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True) + NONE
     twist = damped_step(system, gradient, damping)
     return rotvec_to_rotmat(twist[..., :3]), twist[..., 3:]

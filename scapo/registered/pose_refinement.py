@@ -19,7 +19,7 @@ from torch import Tensor
 from scapo.geometry.points import gather
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
-from scapo.registered.gauss_newton import bounded, by_turn, damped_step
+from scapo.registered.gauss_newton import bounded, by_turn, damped_step, weighted_equations
 from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
 from scapo.registered.view_loss import (
     match_weight,
@@ -191,7 +191,7 @@ def _base_columns(
     """What turn, translation and log scales change of the parts' motions."""
     arm = affine.clone()
     arm[:, :, 3] -= placement.translation[:, None]
-    turned = by_turn(arm.flatten(1, 2)).unflatten(1, arm.shape[1:3]).mT
+    turned = by_turn(arm.flatten(1, 2)).unflatten(1, arm.shape[1:3])
     moved = torch.zeros_like(turned)
     moved[:, :, 3] = torch.eye(3).to(arm)
     scaled = torch.zeros_like(turned)
@@ -249,14 +249,13 @@ def _normal_equations(
     weighted = points * weight[..., None]
     by_normal = (normal[..., None] * points[:, :, None]).flatten(2)  # (H, N, 3 Q)
     across = by_normal @ motion.jacobian.transpose(1, 2).reshape(len(off), -1, size)
-    system = (across * weight[..., None]).mT @ across
-    gradient = across.mT @ ((off * normal).sum(-1) * weight)[..., None]
+    system, gradient = weighted_equations(across, (off * normal).sum(-1), weight)
     every = motion.jacobian.flatten(2)  # (H, Q, 3 D)
     spread = (weighted.mT @ points) @ every
     along = every.unflatten(2, (3, size)).flatten(1, 2)
     system = system + ALONG * along.mT @ spread.unflatten(2, (3, size)).flatten(1, 2)
-    gradient = gradient + ALONG * along.mT @ (weighted.mT @ off).flatten(1)[..., None]
-    return system, gradient[..., 0]
+    pull = ALONG * along.mT @ (weighted.mT @ off).flatten(1)[..., None]
+    return system, gradient + pull[..., 0]
 
 
 def _step(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
+from scipy.cluster.vq import kmeans2
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.testing import assert_close
@@ -239,3 +240,12 @@ def test_k_nearest_of_features():
     )
     index = cloud.k_nearest(source, target, 3)
     assert torch.equal(index, torch.cdist(source, target).topk(3, largest=False).indices)
+
+
+def test_k_means_are_scipys_and_a_centre_without_points_stays():
+    points = normal(3, 60, 3)
+    found = cloud.k_means(points, points[:4], 6)
+    expected = kmeans2(points.numpy(), points[:4].numpy(), iter=6, minit="matrix")[0]
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
+    far = torch.full((1, 3), 100.0, dtype=points.dtype)
+    assert torch.equal(cloud.k_means(points, torch.cat([points[:4], far]), 6)[4:], far)

@@ -3,17 +3,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from scapo.geometry.rigid import axis_angle
 from scapo.records import take
+from scapo.registered import discovery
 from scapo.registered.bundle_adjustment import Candidate, Inliers, densified, refit
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.discovery import completed, held_out, leaders, mirrored
+from scapo.registered.discovery import advance, completed, held_out, leaders, mirrored
 from scapo.registered.initialisation import fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
+from scapo.registered.pose_search import SearchResult
 from scapo.registered.template import ArticulatedTemplate
+from scapo.registered.views import PartialViews
 from tests.helpers.sighted import AXIS, sighted, template
 from tests.helpers.strategies import generator
 
@@ -57,6 +62,44 @@ def test_views_that_judge_are_held_out():
     assert torch.cdist(judges.points[:, 0], others.points[:, 0]).min() > 0
 
 
+def test_mirror_images_take_the_first_round_on_half_of_the_views(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What `discover` hands to each step, the steps themselves left out."""
+    views, truth = sighted(16, seed=1)
+    first = Candidate(template=template(), inliers=Inliers(views=views, placement=truth))
+    none = torch.zeros(16)
+    everywhere = SearchResult(placement=truth, loss=none, margin=none)
+    calls: list[tuple[str, int, object]] = []
+
+    def completing(best: Candidate, judges: PartialViews, half: PartialViews, *_: object):
+        calls.append(("completed", len(half.points), len(judges.points)))
+        return best
+
+    def advancing(best: Candidate, searched: PartialViews, share: float, *_: object):
+        calls.append(("advance", len(searched.points), share))
+        return best
+
+    for name, step in {
+        "_first": lambda *_: [first],
+        "completed": completing,
+        "advance": advancing,
+        "densified": lambda best, *_: best,
+        "search_views": lambda *_: everywhere,
+    }.items():
+        monkeypatch.setattr(discovery, name, step)
+    tried = DiscoveryConfig(searched=12, trusted=(0.5, 0.7), heats=(0.3,), leans=False)
+    expected = {
+        True: [("advance", 6, 0.3), ("completed", 6, 4), ("advance", 12, 0.7)],
+        False: [("advance", 6, 0.3), ("advance", 12, 0.5), ("advance", 12, 0.7)],
+    }
+    for mirror, wanted in expected.items():
+        calls.clear()
+        config = replace(tried, mirror=mirror)
+        discovery.discover(views, ("revolute",), config, generator(0))
+        assert calls == wanted
+
+
 def without_a_side() -> ArticulatedTemplate:
     """The box with its flap, but without its side at positive y."""
     whole = template(count=500)
@@ -84,22 +127,51 @@ def test_the_base_is_mirrored_and_the_part_is_not() -> None:
     assert torch.equal(whole.pivot, cut.pivot)
 
 
-@pytest.mark.slow
-def test_a_side_that_inliers_never_saw_is_there_after_a_round(
-    caplog: pytest.LogCaptureFixture,
+def test_the_mirror_image_that_completes_the_base_is_kept(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Rounds left out, as if all views had been placed right: the judges choose."""
     caplog.set_level("INFO", "scapo.registered.discovery")
-    views, truth = sighted(28, seed=91)
-    config = DiscoveryConfig(rotations=300, trusted=(0.8,), template_points=200, final_points=600)
-    left = Inliers(views=views, placement=truth).cameras()[:, 1] < -0.1
-    seen = left.nonzero()[:, 0]
-    inliers = Inliers(views=take(views, seen), placement=take(truth, seen))
-    start = Candidate(template=without_a_side(), inliers=inliers)
-    after = completed(start, views, views, config, generator(0))
-    found = after.template
+    views, truth = sighted(12, seed=91)
+    anywhere: list[bool] = []
+
+    def placed(one: Candidate, *_: object, **options: bool) -> Candidate:
+        anywhere.append(options.get("anywhere", False))
+        return replace(one, inliers=Inliers(views=views, placement=truth))
+
+    monkeypatch.setattr(discovery, "advance", placed)
+    monkeypatch.setattr(discovery, "densified", lambda one, *_: one)
+    start = placed(
+        Candidate(template=without_a_side(), inliers=Inliers(views=views, placement=truth))
+    )
+    anywhere.clear()
+    judges = take(
+        views, (Inliers(views=views, placement=truth).cameras()[:, 1] > 0.2).nonzero()[:, 0]
+    )
+    config = DiscoveryConfig(rotations=200)
+    found = completed(start, judges, views, config, generator(0)).template
     assert "kept: 2" in caplog.text  # 0 as it was, then its image along x, y, z
+    assert (found.normals[found.logit.argmax(-1) == 0, 1] > 0.8).sum() > 15
+    assert anywhere == [False, True, True, True]
+
+
+@pytest.mark.slow
+def test_views_of_a_side_that_inliers_never_saw_find_it() -> None:
+    """A round on a mirrored base: its views are placed on that side, which they rebuild."""
+    views, truth = sighted(20, seed=91)
+    config = DiscoveryConfig(rotations=300, template_points=200, final_points=600)
+    cameras = Inliers(views=views, placement=truth).cameras()
+    seen = (cameras[:, 1] < -0.1).nonzero()[:, 0]
+    inliers = Inliers(views=take(views, seen), placement=take(truth, seen))
+    start = Candidate(template=mirrored(without_a_side(), 1), inliers=inliers)
+    after = advance(start, views, 0.8, config, generator(0), anywhere=True)
+    found, kept = after.template, after.inliers.views.points
     base = found.logit.argmax(-1) == 0
     assert (found.normals[base, 1] > 0.8).sum() > 15
     assert (found.normals[base, 1] < -0.8).sum() > 15
-    dense = densified(after, config, generator(0))
-    assert len(dense.template.points) == config.final_points
+    which = torch.cdist(kept[:, 0], views.points[:, 0]).argmin(1)
+    other = cameras[which, 1] > 0.1
+    agree = (after.inliers.cameras() * cameras[which]).sum(-1) > 0.9
+    assert other.sum() >= 4
+    assert agree[other].float().mean() > 0.6
+    assert len(densified(after, config, generator(0)).template.points) == config.final_points

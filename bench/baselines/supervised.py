@@ -1,0 +1,469 @@
+# SPDX-License-Identifier: MIT
+"""What the supervised baselines share: heads on a point network, targets, losses, prediction.
+
+A body turns a cloud into features per point and one code; everything after it is here, so that the
+baselines differ in their bodies alone. Points vote for the pose: each says where it lies in the
+frame of every part, and a Procrustes step turns the votes into a rotation and a translation (the
+nearest rotation of a 3 x 3 matrix, so no axis of a pair is favoured as by Gram-Schmidt). The
+alternative `pooled` is what pose regression usually is: two axis vectors by Gram-Schmidt and an
+offset from the part's mean, from features pooled over the part. Joints are said in the frame of the
+base and placed by its pose; states are read off the poses of the two parts.
+
+Lengths are in units of twice the mean radius: the cloud is centred with mean radius 0.5.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from bench.baselines.body import Block, Body, Features
+from scapo.categories import Category
+from scapo.geometry.numerics import at_least_float32
+from scapo.geometry.points import MEAN_RADIUS, gather, normalise
+from scapo.geometry.rigid import apply, invert, mean_rotation, random_rotations, rigid
+from scapo.geometry.rotations import rotmat_to_rotvec
+from scapo.method import AbstractMethod, Mode, Stage, Step, changes
+from scapo.paper.vector_neurons import initialise
+from scapo.registered.network import procrustes
+from scapo.types import Joints, Labels, Observation, Prediction, Supervision
+
+RADIUS = 0.5
+"""Mean distance of a cloud's points from their centroid, as bodies see them."""
+GROW = RADIUS / MEAN_RADIUS
+SMOOTH = 1e-4
+"""Squared length under the root of a distance, which so has a gradient everywhere."""
+BEND = 0.05
+"""Length up to which the smooth L1 losses are quadratic."""
+ROUNDS, TRUST = 4, 0.05
+"""Repetitions of the Procrustes step, each with votes weighed by 1 / (1 + (off / TRUST)^2)."""
+TINY = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearningConfig:
+    """Heads, augmentation and training of a supervised baseline."""
+
+    pose: Literal["votes", "pooled"] = "votes"
+    """How part poses are found: by votes of all points, or regressed from pooled features."""
+    width: int = 128
+    """Channels of the hidden layer of each head."""
+    dropout: float = 0.5
+    """Share of the features that the segmentation does not see in a training step."""
+    either_order: bool = True
+    """Take the labels or, where parts of the category are exchanged by a symmetry, the exchanged
+    ones, whichever costs a cloud less: what the evaluation accepts."""
+    rotated: float = 0.5
+    """Share of the clouds that are turned by a random rotation in a training step."""
+    noisy: float = 0.5
+    """Share of the clouds that get noise in a training step."""
+    noise: float = 1e-3
+    """Standard deviation of the noise, in units of twice the mean radius."""
+    points: int | None = None
+    """Points that the network sees at a time: random ones in training; a prediction goes over all
+    points in clouds of at most so many. None: all."""
+    segmentation_weight: float = 1.0
+    """Of the cross entropy of the part labels."""
+    pose_weight: float = 5.0
+    """Of the distance of the votes, or of rotation and translation when pooled."""
+    pivot_weight: float = 5.0
+    """Of the smooth L1 distance of the pivot."""
+    axis_weight: float = 1.0
+    """Of 1 - cos of the angle between the axes."""
+    epochs: int = 200
+    """Of the one stage."""
+    lr: float = 1e-3
+    """Learning rate of Adam at the start, on half a cosine from there."""
+    min_lr: float = 1e-6
+    """Learning rate at the end."""
+    weight_decay: float = 1e-8
+    """Added to the gradient."""
+    batch: int = 16
+    """Clouds a step."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What the heads say, in the frame and unit of the points."""
+
+    part: Float[Tensor, "B N P"]
+    """Logits."""
+    votes: Float[Tensor, "B N P 3"] | None
+    """Each point in the frame of each part; None when pooled."""
+    pose: Float[Tensor, "B P 4 4"] | None
+    """None as long as there are only votes."""
+    pivot: Float[Tensor, "B J 3"]
+    """In the frame of the base, as the axis."""
+    axis: Float[Tensor, "B J 3"]
+    """Not of unit length."""
+
+
+class Heads(nn.Module):
+    """Features to an answer."""
+
+    def __init__(self, body: Body, category: Category, config: LearningConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.parts, self.joints = len(category.parts), len(category.joints)
+        width = config.width
+        self.segment = nn.Linear(body.features, self.parts)
+        if config.pose == "votes":
+            self.vote = nn.Sequential(Block(body.features, width), nn.Linear(width, 3 * self.parts))
+        else:
+            self.regress = _two_layers(body.features + body.code, width, 9)
+        self.joint = _two_layers(body.code, width, 6 * self.joints)
+
+    def forward(
+        self,
+        points: Float[Tensor, "B N 3"],
+        features: Features,
+        generator: torch.Generator | None,
+    ) -> Answer:
+        """With dropout where a generator is given."""
+        x = features.points
+        kept = x
+        if generator is not None and self.config.dropout:
+            draw = torch.rand(x.shape, generator=generator, device=x.device)
+            kept = x * (draw >= self.config.dropout) / (1 - self.config.dropout)
+        part = at_least_float32(self.segment(kept))
+        joint = at_least_float32(self.joint(features.code)).unflatten(1, (self.joints, 6))
+        pivot, axis = joint.split(3, -1)
+        votes = pose = None
+        if self.config.pose == "votes":
+            votes = at_least_float32(self.vote(x)).unflatten(-1, (self.parts, 3))
+        else:
+            pose = self._pooled(points, features, part)
+        return Answer(part=part, votes=votes, pose=pose, pivot=pivot, axis=axis)
+
+    def _pooled(
+        self, points: Float[Tensor, "B N 3"], features: Features, part: Float[Tensor, "B N P"]
+    ) -> Float[Tensor, "B P 4 4"]:
+        """Rotation and offset from the part's mean, from features weighted by the segmentation."""
+        weight = part.detach().softmax(-1)
+        weight = weight / weight.sum(1, keepdim=True).clamp_min(TINY)  # (B, N, P)
+        pooled = weight.mT @ at_least_float32(features.points)  # (B, P, C)
+        code = at_least_float32(features.code)[:, None].expand(-1, self.parts, -1)
+        out = at_least_float32(self.regress(torch.cat([pooled, code], -1)))
+        return rigid(gram_schmidt(out[..., :3], out[..., 3:6]), weight.mT @ points + out[..., 6:])
+
+
+def _two_layers(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, outputs))
+
+
+def gram_schmidt(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
+    """The rotation whose first column is along a and whose second lies in the plane of a and b."""
+    first = F.normalize(a, dim=-1)
+    second = F.normalize(b - (first * b).sum(-1, keepdim=True) * first, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """What the answer should be, in the frame and unit of the points."""
+
+    part: Int[Tensor, "B N"]
+    """-1: not known."""
+    pose: Float[Tensor, "B P 4 4"]
+    pivot: Float[Tensor, "B J 3"]
+    axis: Float[Tensor, "B J 3"]
+    """Unit vectors."""
+
+
+def exchanged(target: Target, symmetry: Float[Tensor, "3 3"]) -> Target:
+    """The same truth with the parts exchanged that the category's symmetry exchanges.
+
+    As the evaluator relabels: of two parts both, of three the last two with their joints;
+    rotations times the symmetry from the right. Where base and child change roles, the joint
+    turns the other way.
+    """
+    turn = rigid(symmetry, symmetry.new_zeros(3))
+    if target.pose.shape[1] == 2:
+        order, joints, sign = torch.tensor([1, 0]), torch.tensor([0]), -1.0
+    else:
+        order, joints, sign = torch.tensor([0, 2, 1]), torch.tensor([1, 0]), 1.0
+    order, joints = order.to(target.part.device), joints.to(target.part.device)
+    return Target(
+        part=torch.where(target.part >= 0, order[target.part], target.part),
+        pose=target.pose[:, order] @ turn,
+        pivot=target.pivot[:, joints],
+        axis=sign * target.axis[:, joints],
+    )
+
+
+def penalties(
+    points: Float[Tensor, "B N 3"], answer: Answer, target: Target, config: LearningConfig
+) -> dict[str, Float[Tensor, " B"]]:
+    """The weighted terms of the loss for each cloud; points without a label count nowhere.
+
+    The pivot is compared with the point of the true axis nearest to the origin of the base.
+    """
+    known = (target.part >= 0).to(points.dtype)
+    count = known.sum(1).clamp_min(1)
+    entropy = F.cross_entropy(
+        answer.part.mT, target.part, ignore_index=-1, reduction="none"
+    ).sum(1)  # fmt: skip
+    terms = {"segmentation": config.segmentation_weight * entropy / count}
+    if answer.votes is not None:
+        true = apply(invert(target.pose), points[:, None]).transpose(1, 2)  # (B, N, P, 3)
+        off = ((answer.votes - true).square().sum(-1) + SMOOTH).sqrt().mean(-1)
+        terms["votes"] = config.pose_weight * (known * off).sum(1) / count
+    if answer.pose is not None:
+        turn = (answer.pose - target.pose)[..., :3, :3].abs().mean((1, 2, 3))
+        shift = _smooth(answer.pose[..., :3, 3], target.pose[..., :3, 3])
+        terms |= {"rotation": config.pose_weight * turn, "translation": config.pose_weight * shift}
+    base = invert(target.pose[:, 0])
+    axis = target.axis @ base[:, :3, :3].mT
+    pivot = apply(base, target.pivot)
+    pivot = pivot - (pivot * axis).sum(-1, keepdim=True) * axis
+    cosine = F.cosine_similarity(answer.axis, axis, dim=-1)
+    return terms | {
+        "pivot": config.pivot_weight * _smooth(answer.pivot, pivot),
+        "axis": config.axis_weight * (1 - cosine).mean(1),
+    }
+
+
+def _smooth(found: Float[Tensor, "B K 3"], true: Float[Tensor, "B K 3"]) -> Float[Tensor, " B"]:
+    return F.smooth_l1_loss(found, true, beta=BEND, reduction="none").sum(-1).mean(1)
+
+
+def best_order(
+    points: Float[Tensor, "B N 3"],
+    answer: Answer,
+    targets: list[Target],
+    config: LearningConfig,
+) -> dict[str, Tensor]:
+    """Means of the terms, each cloud against the target that costs it least in all."""
+    found = [penalties(points, answer, target, config) for target in targets]
+    totals = torch.stack([torch.stack(list(terms.values())).sum(0) for terms in found])
+    chosen = totals.argmin(0, keepdim=True)  # (1, B)
+    return {
+        name: torch.stack([terms[name] for terms in found]).gather(0, chosen).mean()
+        for name in found[0]
+    }
+
+
+@torch.no_grad()
+def poses_by_vote(
+    points: Float[Tensor, "B N 3"],
+    votes: Float[Tensor, "B N P 3"],
+    weight: Float[Tensor, "B N P"],
+) -> Float[Tensor, "B P 4 4"]:
+    """The pose of each part that its votes agree on best, those far off counting less."""
+    batch, _, parts, _ = votes.shape
+    source = votes.transpose(1, 2).flatten(0, 1)  # (B P, N, 3)
+    target = points[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
+    given = weight.transpose(1, 2).flatten(0, 1)
+    rotation, shift = procrustes(target, source, given)
+    for _ in range(ROUNDS):
+        off = (source @ rotation.mT + shift[:, None] - target).square().sum(-1)
+        rotation, shift = procrustes(target, source, given / (1 + off / TRUST**2))
+    return rigid(rotation, shift).unflatten(0, (batch, parts))
+
+
+def mean_pose(poses: Float[Tensor, "H *B 4 4"]) -> Float[Tensor, "*B 4 4"]:
+    """Chordal mean of the rotations, mean of the translations."""
+    rotation = mean_rotation(poses[..., :3, :3].movedim(0, -3))
+    return rigid(rotation, poses[..., :3, 3].mean(0))
+
+
+def states(
+    pose: Float[Tensor, "B P 4 4"],
+    axis: Float[Tensor, "B J 3"],
+    category: Category,
+) -> Float[Tensor, "B J"]:
+    """How far each joint is from rest, by the poses of its parts: about or along the axis.
+
+    Args:
+        pose: Of the parts.
+        axis: Unit vectors, in the frame of the base.
+        category: Says which parts a joint links and how.
+    """
+    found = []
+    for j, joint in enumerate(category.joints):
+        motion = invert(pose[:, joint.parent]) @ pose[:, joint.child]
+        step = motion[:, :3, 3]
+        if joint.kind == "revolute":
+            step = rotmat_to_rotvec(motion[:, :3, :3])
+        found.append((step * axis[:, j]).sum(-1))
+    return torch.stack(found, 1)
+
+
+class SupervisedMethod(AbstractMethod, ABC):
+    """A body, the heads and their training; a baseline says which body."""
+
+    networks = ("body",)
+    learning: LearningConfig
+
+    def __init__(
+        self,
+        config: Any,  # noqa: ANN401 - the baseline's, which holds `learning`
+        category: Category,
+        make_body: Callable[[], Body],
+        generator: torch.Generator,
+    ) -> None:
+        """Build body and heads and draw their weights.
+
+        Args:
+            config: With a `preset` and a `learning`.
+            category: Fixes the number of parts and joints.
+            make_body: Called once.
+            generator: On the CPU; the only source of the initial weights.
+        """
+        super().__init__()
+        self.config, self.learning, self.category = config, config.learning, category
+        self.supervision: frozenset[Supervision] = frozenset({"pose", "segmentation", "joint"})
+        with torch.random.fork_rng(devices=[]):  # layers draw before `initialise` draws again
+            self.body = make_body()
+            self.heads = Heads(self.body, category, config.learning)
+        self.least_points = self.body.least_points
+        initialise(self, generator)
+
+    @property
+    @abstractmethod
+    def default(self) -> Any:  # noqa: ANN401 - of the configuration's type
+        """The configuration of the preset that this one started from."""
+
+    @property
+    def variant(self) -> str:
+        """The preset and the options that differ from it."""
+        words = [] if self.config.preset == "paper" else [self.config.preset]
+        leave = [f"learning.{name}" for name in ("lr", "min_lr", "weight_decay")]
+        return "-".join(words + changes(self.config, self.default, leave=["preset", *leave]))
+
+    def stages(self) -> tuple[Stage, ...]:
+        """One, of Adam on half a cosine."""
+        learning = self.learning
+        return (
+            Stage(
+                name="learn",
+                epochs=learning.epochs,
+                lr=learning.lr,
+                min_lr=learning.min_lr,
+                weight_decay=learning.weight_decay,
+                batch=learning.batch,
+            ),
+        )
+
+    def start(
+        self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> None:
+        """Nothing to prepare."""
+        del stage, observation, labels, generator
+
+    def answer(self, points: Float[Tensor, "B N 3"], generator: torch.Generator | None) -> Answer:
+        """Run body and heads."""
+        return self.heads(points, self.body(points, generator), generator)
+
+    def answer_all(self, points: Float[Tensor, "B N 3"]) -> Answer:
+        """The answer for all points, from clouds as thin as those of the training.
+
+        The cloud is dealt like cards; what each hand says of the whole is averaged.
+        """
+        number = points.shape[1]
+        hands = -(-number // (self.learning.points or number))
+        dealt = [torch.arange(hand, number, hands) for hand in range(hands)]
+        answers = [self.answer(points[:, some.to(points.device)], None) for some in dealt]
+        back = torch.cat(dealt).argsort().to(points.device)
+        votes = [answer.votes for answer in answers if answer.votes is not None]
+        poses = [answer.pose for answer in answers if answer.pose is not None]
+        return Answer(
+            part=torch.cat([answer.part for answer in answers], 1)[:, back],
+            votes=torch.cat(votes, 1)[:, back] if votes else None,
+            pose=mean_pose(torch.stack(poses)) if poses else None,
+            pivot=torch.stack([answer.pivot for answer in answers]).mean(0),
+            axis=torch.stack([F.normalize(answer.axis, dim=-1) for answer in answers]).mean(0),
+        )
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        """Weighted terms for a batch of clouds, turned and disturbed while training.
+
+        Raises:
+            ValueError: Labels are withheld.
+        """
+        points, target = self._normalised(observation, labels)
+        if self.training:
+            points, target = augmented(points, target, self.learning, step.generator)
+        answer = self.answer(points, step.generator if self.training else None)
+        targets = [target]
+        if self.learning.either_order and self.category.symmetry is not None:
+            targets.append(exchanged(target, points.new_tensor(self.category.symmetry)))
+        return best_order(points, answer, targets, self.learning)
+
+    def _normalised(
+        self, observation: Observation, labels: Labels
+    ) -> tuple[Float[Tensor, "B N 3"], Target]:
+        """Clouds of mean radius 0.5, and the labels in their frame."""
+        if labels.part is None or labels.camera_T_part is None or labels.joints is None:
+            raise ValueError(f"{self.name}: expected parts, poses and joints, found some withheld")
+        points, similarity = normalise(observation.points)
+        pose = labels.camera_T_part.clone()
+        pose[..., :3, 3] = GROW * similarity.forward(pose[..., :3, 3])
+        return GROW * points, Target(
+            part=labels.part.long(),
+            pose=pose,
+            pivot=GROW * similarity.forward(labels.joints.pivot),
+            axis=F.normalize(labels.joints.axis, dim=-1),
+        )
+
+    @torch.no_grad()
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
+        """Parts, poses and joints; there is one way for both modes."""
+        del mode
+        points, similarity = normalise(observation.points)
+        answer = self.answer_all(GROW * points)
+        weight, pose = answer.part.softmax(-1), answer.pose
+        if answer.votes is not None:
+            pose = poses_by_vote(GROW * points, answer.votes, weight)
+        assert pose is not None  # noqa: S101 - heads answer with votes or poses
+        axis, base = F.normalize(answer.axis, dim=-1), pose[:, 0]
+        pivot = apply(base, answer.pivot)
+        state = states(pose, axis, self.category)
+        slide = torch.tensor([joint.kind == "prismatic" for joint in self.category.joints])
+        scale = GROW * similarity.scale[:, None]
+        metric = pose.clone()
+        metric[..., :3, 3] = similarity.inverse(pose[..., :3, 3] / GROW)
+        return Prediction(
+            part_weight=weight,
+            camera_T_part=metric,
+            joints=Joints(
+                pivot=similarity.inverse(pivot / GROW),
+                axis=axis @ base[:, :3, :3].mT,
+                state=torch.where(slide.to(state.device), state / scale, state),
+            ),
+        )
+
+
+def augmented(
+    points: Float[Tensor, "B N 3"],
+    target: Target,
+    config: LearningConfig,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "B K 3"], Target]:
+    """Some of the points, some clouds turned with their truth and some disturbed."""
+    batch, number, _ = points.shape
+    draw = {"generator": generator, "device": points.device}
+    part = target.part
+    if config.points is not None and config.points < number:
+        chosen = torch.rand(batch, number, **draw).topk(config.points, dim=1).indices
+        points, part = gather(points, chosen), part.gather(1, chosen)
+    turned = torch.rand(batch, 1, 1, **draw) < config.rotated
+    rotation = random_rotations(batch, generator, dtype=points.dtype)
+    rotation = torch.where(turned, rotation, torch.eye(3).to(points))
+    disturbed = torch.rand(batch, 1, 1, **draw) < config.noisy
+    noise = config.noise * torch.randn(points.shape, dtype=points.dtype, **draw)
+    pose = rigid(rotation, rotation.new_zeros(batch, 3))
+    return apply(pose, points) + noise * disturbed, replace(
+        target,
+        part=part,
+        pose=pose[:, None] @ target.pose,
+        pivot=apply(pose, target.pivot),
+        axis=target.axis @ rotation.mT,
+    )

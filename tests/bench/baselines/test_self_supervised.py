@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: MIT
+"""Methods without labels: true, wrong and withheld ones leave the same weights and answers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from bench.methods import METHODS
+from scapo.categories import CATEGORIES
+from scapo.method import AbstractMethod
+from scapo.store.samples import TrainingData
+from scapo.training.fit import FitConfig, fit
+from scapo.types import Labels
+from tests.bench.baselines.eap.test_method import TINY as EAP
+from tests.bench.baselines.op_align.test_method import TINY as OP_ALIGN
+from tests.helpers.hinged import plates
+from tests.helpers.strategies import generator
+
+CONFIGS = {"op-align": replace(OP_ALIGN, epochs=1), "eap": replace(EAP, epochs=(1, 1))}
+
+
+def trained(name: str, labels: Labels, folder: Path) -> AbstractMethod:
+    method = METHODS[name].build(CONFIGS[name], CATEGORIES["laptop"], generator(0))
+    observation, _ = plates(8, 48)
+    data = TrainingData(observation=observation, labels=labels, digest="plates")
+    fit(method, data, folder, FitConfig(pictures_every=None))
+    return method.eval()
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_labels_change_neither_training_nor_prediction(name: str, tmp_path: Path) -> None:
+    observation, true = plates(8, 48)
+    _, wrong = plates(8, 48, seed=5)
+    runs = [
+        trained(name, labels, tmp_path / str(k)) for k, labels in enumerate((true, wrong, Labels()))
+    ]
+    first, *others = (run.state_dict() for run in runs)
+    for other in others:
+        assert all(torch.equal(first[key], other[key]) for key in first)
+    one, *more = (run.predict(observation) for run in runs)
+    assert one.camera_T_part is not None
+    for answer in more:
+        assert answer.camera_T_part is not None
+        assert torch.equal(answer.part_weight, one.part_weight)
+        assert torch.equal(answer.camera_T_part, one.camera_T_part)

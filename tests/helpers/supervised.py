@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+"""Supervised baselines small enough to train within a test."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bench.baselines import gcn3d, pointnet2
+from bench.baselines.supervised import SupervisedMethod, Target
+from scapo.categories import CATEGORIES
+from scapo.method import Step
+from scapo.types import Labels, Observation
+from tests.helpers.strategies import generator
+
+LEAN: dict[str, Any] = {
+    "pointnet2": replace(
+        pointnet2.cpu_config(),
+        centres=(32, 8),
+        near_samples=(4, 6, 8),
+        near_widths=((8, 16), (16, 16), (16, 32)),
+        far_samples=(4, 8),
+        far_widths=((32, 32), (32, 64)),
+        whole_widths=(64, 128),
+        back_widths=((64,), (64,), (64,)),
+    ),
+    "gcn3d": replace(gcn3d.cpu_config(), neighbours=8, widths=(16, 16, 32, 32, 64), fuse=(64, 64)),
+}
+MAKERS: dict[str, Any] = {"pointnet2": pointnet2.PointNet2, "gcn3d": gcn3d.Gcn3d}
+NAMES = tuple(MAKERS)
+
+
+def lean(name: str, category: str = "laptop", **learning: Any) -> SupervisedMethod:
+    """A network of some 50,000 parameters that sees its clouds as they are."""
+    config = LEAN[name]
+    still = {"points": None, "rotated": 0.0, "noisy": 0.0, "dropout": 0.0} | learning
+    config = replace(config, learning=replace(config.learning, **still))
+    return MAKERS[name](config, CATEGORIES[category], generator(0))
+
+
+def a_step(seed: int = 0, count: int = 8) -> Step:
+    return Step(
+        stage="learn", progress=0.0, generator=generator(seed), index=torch.arange(count), total=8
+    )
+
+
+def target_of(observation: Observation, labels: Labels) -> tuple[Target, Tensor]:
+    """Labels and points as they are."""
+    assert labels.part is not None
+    assert labels.camera_T_part is not None
+    assert labels.joints is not None
+    target = Target(
+        part=labels.part,
+        pose=labels.camera_T_part,
+        pivot=labels.joints.pivot,
+        axis=labels.joints.axis,
+    )
+    return target, observation.points
