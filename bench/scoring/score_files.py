@@ -37,7 +37,7 @@ COLUMNS = (
     "method", "variant", "seed", "data", "category", "split",
     "sample", "metric", "slot", "value", "unit",
 )  # fmt: skip
-MAX_TEXT = 256 << 20
+MAX_TEXT = 64 << 20
 """Bytes of a file of scores, unpacked; 1,000 pairs of glasses take 1.8 million."""
 LONGEST_NAME = 300
 """Characters of a name; a variant is that of the predictions and the readings of the metrics."""
