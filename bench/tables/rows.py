@@ -127,6 +127,11 @@ def titles() -> dict[str, tuple[str, int]]:
     return PUBLISHED | {name: (one.title, one.rank) for name, one in all_methods().items()}
 
 
+def _ranked() -> list[str]:
+    """What tables call the methods, by rank."""
+    return [name for name, _ in sorted(titles().values(), key=lambda one: one[1])]
+
+
 def title(method: str) -> str:
     """What a table calls a method."""
     return REFERENCE.get(method) or titles().get(method, (method, 0))[0]
@@ -167,7 +172,7 @@ def camera_of(results: Results, series: Series) -> bool | None:
 
 def in_order(rows: Sequence[Row]) -> list[Row]:
     """By the rank of methods, each printed row before ours of that method; references last."""
-    order = [name for name, _ in sorted(titles().values(), key=lambda one: one[1])]
+    order = _ranked()
 
     def rank(row: Row) -> tuple[int, int]:
         known = [i for i, name in enumerate(order) if row.method.startswith(name)]
@@ -209,7 +214,7 @@ def left_out(
     """
     series = {one for kind in kinds for one in results.series(kind)}
     run = {title(one.method) for one in series}
-    names = dict.fromkeys((*REFERENCE.values(), *(name for name, _ in titles().values())))
+    names = dict.fromkeys((*REFERENCE.values(), *_ranked()))
     missing = {"Not run": [name for name in names if name not in run]}
     plain = sorted(one for one in series if not one.switches)
     for reading, words in READINGS.items():
