@@ -41,23 +41,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if words == ["--version"]:
         say(Console(), f"scapo-bench {version('scapo')}")
         sys.exit(0)
-    command: Any = tyro.cli(
-        _commands(words[:1], preset),
-        prog="scapo-bench",
-        description=DESCRIPTION,
-        args=words,
-        config=(
-            tyro.conf.OmitSubcommandPrefixes,
-            tyro.conf.CascadeSubcommandArgs,
-            tyro.conf.FlagCreatePairsOff,
-        ),
-    )
     console, errors = Console(), Console(stderr=True)
     logging.basicConfig(
         format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )
     try:
+        command: Any = tyro.cli(
+            _commands(words[:1], preset),
+            prog="scapo-bench",
+            description=DESCRIPTION,
+            args=words,
+            config=(
+                tyro.conf.OmitSubcommandPrefixes,
+                tyro.conf.CascadeSubcommandArgs,
+                tyro.conf.FlagCreatePairsOff,
+            ),
+        )
         command.run(console)
+    except MemoryError as error:
+        say(errors, f"scapo-bench: expected enough memory, found: {error}")
+        sys.exit(1)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         say(errors, f"scapo-bench: {error}")
         sys.exit(1)

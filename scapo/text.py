@@ -10,6 +10,8 @@ import re
 
 LONGEST = 2000
 """Characters of a message; of longer text the middle is left out."""
+LONGEST_WORD = 200
+"""Characters of a name that is also a folder's."""
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 """What a spreadsheet would compute, after any number of the quotes that prevent it."""
 
@@ -35,6 +37,16 @@ def _shortened(text: str, longest: int) -> str:
         return text
     tail = longest // 3
     return f"{text[: longest - tail - 3]} … {text[len(text) - tail :]}"
+
+
+def is_word(text: str) -> bool:
+    r"""Whether a name from outside can be that of a folder, and nothing but that.
+
+    >>> is_word("laptop"), is_word("../x"), is_word("a/b"), is_word("a\nb"), is_word("..")
+    (True, False, False, False, False)
+    """
+    plain = text.isprintable() and not set(text) & set("/\\")
+    return plain and 0 < len(text) <= LONGEST_WORD and not text.startswith(".")
 
 
 def as_cell(text: str) -> str:

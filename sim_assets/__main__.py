@@ -37,15 +37,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if words == ["--version"]:
         _say(console, f"scapo-data {version('scapo')}")
         sys.exit(0)
-    command: Any = tyro.cli(
-        _commands(),
-        prog="scapo-data",
-        description=DESCRIPTION,
-        args=words,
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-    )
     try:
+        command: Any = tyro.cli(
+            _commands(),
+            prog="scapo-data",
+            description=DESCRIPTION,
+            args=words,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        )
         sys.exit(command.run(console))
+    except MemoryError as error:
+        _say(errors, f"scapo-data: expected enough memory, found: {error}")
+        sys.exit(1)
     except (ValueError, OSError, RuntimeError) as error:
         _say(errors, f"scapo-data: {error}")
         sys.exit(1)

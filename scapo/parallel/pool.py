@@ -8,11 +8,13 @@ each, and end by themselves when the parent is gone.
 
 An error is the job's own. A process that dies or stops need not be: the system may have killed it
 for the memory that others took. So such a job is done again after all others, in a fresh process
-with none beside it, and given up only when that happened `TRIES` times at the same place.
+with none beside it, and given up only when that happened `TRIES` times at the same place. One that
+is silent for too long while its process has the processor hangs by itself: it is given up at once.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -24,6 +26,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar, cast
 
 Job = TypeVar("Job")
@@ -44,6 +47,9 @@ START = 120.0
 """Seconds that a worker may take to start and to import what it needs."""
 TRIES = 3
 """Processes that may die or hang at one label of a job before the job is given up."""
+BUSY = 2 / 3
+"""Share of its silence in which a process has the processor, from which on the job is at fault, and
+not a machine that has others to serve."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,6 +82,17 @@ class _Worker:
     """None: idle."""
     begun: bool = False
     heard: float = 0.0
+    spent: float = 0.0
+    """Processor seconds of the process when it was heard."""
+
+    def hear(self) -> None:
+        """Note a sign of life."""
+        self.heard, self.spent = time.monotonic(), _processor_seconds(self.process.pid)
+
+    def silence(self) -> tuple[float, float]:
+        """Seconds since the last sign of life, by the clock and of the processor."""
+        spent = _processor_seconds(self.process.pid) - self.spent
+        return time.monotonic() - self.heard, spent
 
 
 class AbstractPool(ABC, Generic[Job, Result]):
@@ -87,6 +104,8 @@ class AbstractPool(ABC, Generic[Job, Result]):
         function: Callable[[Job, Report], Result],
         jobs: Iterable[Job],
         on_report: Callable[[Job, str, int], None] | None = None,
+        *,
+        within: float = math.inf,
     ) -> Iterator[Outcome[Job, Result]]:
         """Do the jobs; outcomes come in the order in which they end.
 
@@ -95,6 +114,9 @@ class AbstractPool(ABC, Generic[Job, Result]):
             jobs: Handed out in order.
             on_report: Called in this process with the job and each of its reports; the amounts of
                 an attempt that was lost are reported back as negative.
+            within: Seconds without a sign of life after which the first attempt of a job is ended,
+                where that is less than the pool's timeout. A job that was not at fault, since its
+                process was stopped or had to wait for the processor, then has the pool's.
         """
 
     @abstractmethod
@@ -132,6 +154,8 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
         function: Callable[[Job, Report], Result],
         jobs: Iterable[Job],
         on_report: Callable[[Job, str, int], None] | None = None,
+        *,
+        within: float = math.inf,
     ) -> Iterator[Outcome[Job, Result]]:
         """See `AbstractPool.run`."""
         if not self.size:
@@ -143,7 +167,7 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
                 self._hand_out(function, waiting, again)
                 ready = wait([worker.pipe for worker in self._busy()], TICK)
                 for worker in self._busy():
-                    outcome = self._listen(worker, worker.pipe in ready, on_report)
+                    outcome = self._listen(worker, worker.pipe in ready, on_report, within)
                     if outcome is None:
                         continue
                     attempt, worker.attempt = cast("_Attempt", worker.attempt), None
@@ -177,8 +201,8 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
             except (BrokenPipeError, ConnectionResetError):  # it died while idle
                 self._drop(worker)
                 continue
-            worker.attempt = waiting.popleft()
-            worker.begun, worker.heard = False, time.monotonic()
+            worker.attempt, worker.begun = waiting.popleft(), False
+            worker.hear()
 
     def _start(self) -> _Worker:
         context = get_context("spawn")
@@ -196,13 +220,14 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
         worker: _Worker,
         ready: bool,
         on_report: Callable[[Job, str, int], None] | None,
+        within: float,
     ) -> Outcome[Job, Result] | None:
         """The outcome of the worker's job if it has ended."""
         attempt = cast("_Attempt", worker.attempt)
         try:
             while ready and worker.pipe.poll():
                 kind, *content = worker.pipe.recv()
-                worker.heard = time.monotonic()
+                worker.hear()
                 if kind == "begun":
                     worker.begun = True
                 elif kind == "report":
@@ -217,11 +242,21 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
             worker.process.join(timeout=5)  # so that its exit code is known
             self._drop(worker)
             return _outcome(attempt, None, "died", _cause(worker.process.exitcode))
-        limit = self.timeout if worker.begun else max(self.timeout, START)
-        if time.monotonic() - worker.heard > limit:
-            self._drop(worker)
-            return _outcome(attempt, None, "hung", f"no sign of life for {limit:g} s")
-        return None
+        return self._too_silent(worker, attempt, within)
+
+    def _too_silent(
+        self, worker: _Worker, attempt: _Attempt, within: float
+    ) -> Outcome[Job, Result] | None:
+        """The outcome of a job whose process has been silent for too long, which is ended."""
+        limit = self.timeout if attempt.lost else min(self.timeout, within)
+        limit = limit if worker.begun else max(limit, START)
+        silent, spent = worker.silence()
+        if silent <= limit:
+            return None
+        if spent >= BUSY * limit:
+            attempt.lost[attempt.label] = TRIES
+        self._drop(worker)
+        return _outcome(attempt, None, "hung", f"no sign of life for {limit:g} s")
 
     def _drop(self, worker: _Worker) -> None:
         self._workers.remove(worker)
@@ -266,6 +301,14 @@ def _outcome(
     return Outcome(
         job=attempt.job, result=result, failure=failure, reason=reason, label=attempt.label
     )
+
+
+def _processor_seconds(process: int) -> float:
+    """What a process has had of the processor; 0 where the system does not tell (no Linux)."""
+    with suppress(OSError, ValueError, IndexError):
+        words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0
 
 
 def _end(worker: _Worker) -> None:

@@ -8,6 +8,7 @@ failure, the second is made up for by doing the job again elsewhere.
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import socket
@@ -130,6 +131,8 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
         function: Callable[[Job, Report], Result],
         jobs: Iterable[Job],
         on_report: Callable[[Job, str, int], None] | None = None,
+        *,
+        within: float = math.inf,
     ) -> Iterator[Outcome[Job, Result]]:
         """See `AbstractPool.run`; the amounts of a lost attempt are reported back as negative."""
         waiting = deque(_Attempt(job=job) for job in jobs)
@@ -138,7 +141,7 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
             while waiting or self._running:
                 while waiting and len(self._running) < self._slots():
                     attempt = waiting.popleft()
-                    attempt.stream = task.remote(function, attempt.job, self.timeout)
+                    attempt.stream = task.remote(function, attempt.job, self.timeout, within)
                     self._running.append(attempt)
                 streams = [attempt.stream for attempt in self._running]
                 ready, _ = self._ray.wait(
@@ -249,11 +252,13 @@ def _supervise(
     function: Callable[[Any, Report], Any],
     job: Any,  # noqa: ANN401
     timeout: float,
+    within: float,
 ) -> Iterator[tuple[str, int] | Outcome[Any, Any]]:
     """What a Ray task does: yields (label, amount) as it goes on, then the outcome."""
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
-    threading.Thread(target=_do, args=(messages, function, job, timeout), daemon=True).start()
+    arguments = (messages, function, job, timeout, within)
+    threading.Thread(target=_do, args=arguments, daemon=True).start()
     told, heard = time.monotonic(), []
     while True:
         message = _next(messages)
@@ -273,12 +278,12 @@ def _do(
     function: Callable[[Any, Report], Any],
     job: Any,  # noqa: ANN401
     timeout: float,
+    within: float,
 ) -> None:
     """Do the job in the process beside this one; messages: (label, amount), then the outcome."""
     try:
-        for outcome in _pool(timeout).run(
-            function, [job], lambda _, label, amount: messages.put((label, amount))
-        ):
+        pool, heard = _pool(timeout), lambda _, label, amount: messages.put((label, amount))
+        for outcome in pool.run(function, [job], heard, within=within):
             messages.put(outcome)
     except Exception as error:  # noqa: BLE001 - told instead of an endless wait
         reason = describe_error(error)

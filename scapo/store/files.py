@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import secrets
 from collections.abc import Iterable, Mapping
@@ -26,6 +27,10 @@ from scapo.store.schema import StoreError
 SAMPLES = "scapo-samples/1"
 PREDICTIONS = "scapo-predictions/1"
 CHECKPOINT = "scapo-checkpoint/1"
+MAX_VALUES = 1 << 27
+"""Numbers that are read at once, half a gigabyte of float32: a sparse file may say terabytes."""
+MAX_HASHED = 4 << 30
+"""Bytes of a file whose digest is asked for."""
 
 Arrays = dict[str, np.ndarray]
 Header = dict[str, Any]
@@ -42,9 +47,16 @@ def sha256_bytes(data: bytes) -> str:
 
 
 def sha256_file(path: Path) -> str:
-    """SHA-256 of a file's bytes in hex, read in pieces."""
+    """SHA-256 of a file's bytes in hex, read in pieces.
+
+    Raises:
+        StoreError: It is larger than any that is read here: a sparse file may have terabytes.
+    """
     digest = hashlib.sha256()
     with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > MAX_HASHED:
+            raise StoreError(f"{path}: expected at most {MAX_HASHED} bytes, found {size}")
         while piece := file.read(1 << 20):
             digest.update(piece)
     return digest.hexdigest()
@@ -150,15 +162,17 @@ def read(
     """Arrays (all, or those of `names` that are there) and header.
 
     Raises:
-        StoreError: As `read_header`, or a tensor cannot be read as numpy.
+        StoreError: As `read_header`, or a tensor cannot be read as numpy; more than `MAX_VALUES`.
     """
     header = read_header(path, expected)
     arrays: Arrays = {}
     try:
         with _open(Path(path)) as file:
-            for name in file.keys():  # noqa: SIM118 - the file is no mapping
-                if names is None or name in names:
-                    arrays[name] = file.get_tensor(name)
+            wanted = [name for name in file.keys() if names is None or name in names]  # noqa: SIM118
+            values = sum(math.prod(file.get_slice(name).get_shape()) for name in wanted)
+            if values > MAX_VALUES:
+                raise StoreError(f"{path}: expected at most {MAX_VALUES} numbers, found {values}")
+            arrays = {name: file.get_tensor(name) for name in wanted}
     except (SafetensorError, TypeError, AttributeError, OSError) as error:
         raise StoreError(f"{path}: expected numpy-readable tensors, found {error}") from error
     return arrays, header

@@ -7,7 +7,7 @@ file was added, changed or taken away since, is somebody's work: it is refused a
 
 from __future__ import annotations
 
-import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import cast
 
 from scapo.store.files import canonical_json, sha256_file
+from scapo.store.json_records import MAX_JSON, parse_json
+from scapo.store.regular import read_regular
 
 MADE = ".made.json"
 FORMAT = "scapo-folder/1"
@@ -28,6 +30,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
 
     Raises:
         ValueError: Something is in the way that is not `made_here`.
+        OSError: It cannot be written, and which file.
     """
     refuse_foreign(folder, made_here)
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -38,6 +41,9 @@ def whole_folder(folder: Path) -> Iterator[Path]:
         record = {"format": FORMAT, "files": digests(temporary)}
         (temporary / MADE).write_text(canonical_json(record) + "\n", encoding="utf-8")
         swap(temporary, folder, made_here)
+    except OSError as error:  # a full disk is reported without a name, or with the temporary one
+        name = str(error.filename or temporary).replace(str(temporary), str(folder), 1)
+        raise OSError(error.errno, error.strerror or str(error), name) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -76,13 +82,26 @@ def refuse_foreign(folder: Path, known: Callable[[Path], bool], what: str = OURS
     raise ValueError(f"{folder}: expected nothing, or {what}, found {found}")
 
 
+def refuse_inside(target: Path, *sources: Path) -> None:
+    """Refuse a target that lies in what is read, or around it: it would overwrite originals.
+
+    Raises:
+        ValueError: Naming both.
+    """
+    place = Path(os.path.realpath(target))
+    for source in sources:
+        real = Path(os.path.realpath(source))  # a link in a circle is itself
+        if place == real or real in place.parents or place in real.parents:
+            raise ValueError(f"{target}: expected a place outside the source, found it in {source}")
+
+
 def made_here(folder: Path) -> bool:
     """Whether `whole_folder` wrote this folder and nothing in it has changed since."""
     marker = folder / MADE
     if marker.is_symlink() or not marker.is_file():
         return False
     try:
-        record: object = json.loads(marker.read_text(encoding="utf-8"))
+        record: object = parse_json(read_regular(marker, MAX_JSON))
     except (OSError, ValueError, RecursionError):
         return False
     if not isinstance(record, dict):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import types
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
@@ -16,6 +17,8 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 from scapo.store.regular import read_regular
 
 T = TypeVar("T")
+MAX_JSON = 1 << 26
+"""Bytes of a JSON file; what it unfolds to takes up to twenty times as much."""
 
 
 class StoreError(ValueError):
@@ -29,7 +32,7 @@ def read_json(path: Path, error: type[StoreError] = StoreError) -> Any:  # noqa:
         StoreError: It cannot be read, or is not JSON.
     """
     try:
-        return parse_json(read_regular(path))
+        return parse_json(read_regular(path, MAX_JSON))
     except (OSError, ValueError, RecursionError) as problem:
         raise error(f"{path}: expected JSON, found {problem}") from problem
 
@@ -43,7 +46,15 @@ def parse_json(text: str | bytes) -> Any:  # noqa: ANN401
     """
     if isinstance(text, bytes):
         text = text.decode()
-    return json.loads(text, parse_constant=_no_number, parse_float=_finite)
+    return json.loads(text, parse_constant=_no_number, parse_float=_finite, object_pairs_hook=_once)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        counts = Counter(name for name, _ in pairs)
+        raise ValueError(f"the key {counts.most_common(1)[0][0][:100]!r} twice")
+    return found
 
 
 def _no_number(text: str) -> None:

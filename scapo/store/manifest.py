@@ -15,8 +15,12 @@ import numpy as np
 from scapo.categories import JointSpec
 from scapo.geometry.matrices import rotation_error
 from scapo.store.json_records import StoreError, from_json, read_json
+from scapo.store.regular import NOT_OWN, is_odd
+from scapo.text import is_word
 
 FORMAT = "scapo-manifest/1"
+MAX_POINTS = 1 << 24
+"""Of a shard, which is read whole: a quarter of a gigabyte."""
 
 
 class ManifestError(StoreError):
@@ -101,9 +105,12 @@ def read_manifest(path: Path | str) -> Manifest:
     """Read and validate; fields that this version does not know are left alone.
 
     Raises:
-        ManifestError: No file, broken JSON, another format, a missing or contradictory field.
+        ManifestError: No file, or a link, a pipe or a device; broken JSON, another format, a
+            missing or contradictory field.
     """
     path = Path(path)
+    if is_odd(path):
+        raise ManifestError(f"{path}: {NOT_OWN}")
     if not path.exists():
         raise ManifestError(f"{path}: expected a manifest, found no file")
     data = read_json(path, ManifestError)
@@ -111,6 +118,9 @@ def read_manifest(path: Path | str) -> Manifest:
         found = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise ManifestError(f"{path}: expected format {FORMAT!r}, found {found!r}")
     manifest = from_json(Manifest, data, str(path), error=ManifestError)
+    for name in ("category", "split"):
+        found = getattr(manifest, name)
+        _expect(is_word(found), f"{path}: {name}: expected a folder's name, found {found!r}")
     _check_joints(path, manifest)
     _check_instances(path, manifest)
     _check_shards(path, manifest)
@@ -123,8 +133,10 @@ def _expect(holds: bool, message: str) -> None:
 
 
 def _unique(path: Path, what: str, names: Sequence[str]) -> None:
-    for i, name in enumerate(names):
-        _expect(name not in names[:i], f"{path}: expected different {what}, found {name!r} twice")
+    seen: set[str] = set()
+    for name in names:
+        _expect(name not in seen, f"{path}: expected different {what}, found {name!r} twice")
+        seen.add(name)
 
 
 def _check_joints(path: Path, manifest: Manifest) -> None:
@@ -186,6 +198,11 @@ def _check_shards(path: Path, manifest: Manifest) -> None:
             shard.first == first and shard.count > 0,
             f"{path}: shard {shard.file}: expected first {first} and a count of 1 or more, "
             f"found {shard.first} and {shard.count}",
+        )
+        _expect(
+            shard.count * manifest.points <= MAX_POINTS,
+            f"{path}: shard {shard.file}: expected at most {MAX_POINTS} points, found "
+            f"{shard.count} samples of {manifest.points}",
         )
         _expect(
             shard.file not in ("", "..") and Path(shard.file).name == shard.file,

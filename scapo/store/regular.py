@@ -14,6 +14,16 @@ from pathlib import Path
 MAX_BYTES = 1 << 30
 """Of a file that is read whole, where its reader has no bound of its own."""
 
+NOT_OWN = "expected a file of its own, found a link, a folder or a device"
+
+
+def is_odd(path: Path) -> bool:
+    """Whether a record's name stands for something else than a file beside the data.
+
+    A link leads to other people's files, a pipe or a device nowhere.
+    """
+    return path.is_symlink() or (path.exists() and not path.is_file())
+
 
 def read_regular(path: Path, limit: int = MAX_BYTES) -> bytes:
     """The bytes of a file, links followed.

@@ -84,8 +84,11 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
         """
         index = self._inside(indices)
         shard_of = np.searchsorted(self._ends, index, side="right")
+        shards = np.unique(shard_of)
+        for shard in shards:  # first, so that room is made for what is there alone
+            self._shard(int(shard))
         out = {name: self._room(name, len(index)) for name in self.names}
-        for shard in np.unique(shard_of):
+        for shard in shards:
             rows = np.flatnonzero(shard_of == shard)
             local = index[rows] - self.split.manifest.shards[shard].first
             # numpy copies in this thread; torch would wake its others for each small tensor.

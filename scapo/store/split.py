@@ -24,7 +24,7 @@ from scapo.store.files import (
 )
 from scapo.store.json_records import parse_json
 from scapo.store.manifest import Manifest, read_manifest
-from scapo.store.regular import read_regular
+from scapo.store.regular import is_odd, read_regular
 from scapo.store.schema import LAYOUT, StoreError, check_samples, sample_shapes
 
 
@@ -161,14 +161,16 @@ def _folders(path: Path) -> list[Path]:
 
 def _is_split(folder: Path, category: str | None, split: str) -> bool:
     path = folder / "manifest.json"
-    if not path.is_file():
+    if is_odd(path):
+        return folder.name == split  # so that opening it says what is wrong
+    if not path.exists():
         return False
     try:
         data: object = parse_json(read_regular(path))
     except (OSError, ValueError, RecursionError):
         return folder.name == split
     if not isinstance(data, dict):
-        return folder.name == split  # so that opening it says what is wrong
+        return folder.name == split
     fields = cast("dict[str, object]", data)
     return fields.get("split") == split and category in (None, fields.get("category"))
 

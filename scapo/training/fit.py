@@ -174,12 +174,12 @@ class Trainer:
 
     @contextlib.contextmanager
     def _explained(self) -> Iterator[None]:
-        """A full disk or a folder that cannot be written, as one line with what is left."""
+        """A full disk or a file that cannot be written, as one line with what is left."""
         try:
             yield
         except OSError as error:
             raise StoreError(
-                f"{self.folder.path}: expected a folder that can be written, found "
+                f"{error.filename or self.folder.path}: expected to be written, found: "
                 f"{error.strerror or error}; {kept(self.folder.path)}"
             ) from error
 

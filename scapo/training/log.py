@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -51,7 +53,12 @@ class Log:
         """
         self.folder, self.total = folder, total
         self.file = None if folder is None else _continued(folder / "metrics.jsonl", step)
-        self.board = None if folder is None else _board(folder / "tensorboard", step)
+        self.hook, threading.excepthook = threading.excepthook, self._of_thread
+        try:
+            self.board = None if folder is None else _board(folder / "tensorboard", step)
+        except BaseException:
+            threading.excepthook = self.hook
+            raise
         self.sums: dict[str, Tensor] = {}
         self.count = 0
         self.rate = 0.0
@@ -73,26 +80,27 @@ class Log:
         means = self.total(means)
         row = dict(zip(self.sums, means.tolist(), strict=True))
         self.latest = row["loss"]
-        record = {"step": step, "stage": stage, "lr": self.rate, **row}
-        if self.file is not None:
-            self.file.write(canonical_json(record) + "\n")
-            self.file.flush()
+        self._append({"step": step, "stage": stage, "lr": self.rate, **row})
         for name, value in row.items():
             self.scalar(f"{stage}/{name}", value, step)
         self.sums, self.count = {}, 0
 
     def validation(self, step: int, stage: str, loss: float) -> None:
         """A line of a validation pass."""
-        if self.file is not None:
-            record = {"step": step, "stage": stage, "validation": loss}
-            self.file.write(canonical_json(record) + "\n")
-            self.file.flush()
+        self._append({"step": step, "stage": stage, "validation": loss})
         self.scalar(f"{stage}/validation", loss, step)
+
+    def _append(self, record: dict[str, Any]) -> None:
+        if self.file is not None:
+            with _named(self.file.name):
+                self.file.write(canonical_json(record) + "\n")
+                self.file.flush()
 
     def scalar(self, name: str, value: float, step: int) -> None:
         """A number for TensorBoard alone."""
         if self.board is not None:
-            self.board.add_scalar(name, value, step)
+            with _named(self.folder):
+                self.board.add_scalar(name, value, step)
 
     def picture(self, name: str, picture: PictureData, step: int) -> None:
         """A PNG in pictures/, replacing the one of that name, and an image for TensorBoard."""
@@ -101,14 +109,32 @@ class Log:
         png, pixels = draw.render(picture)
         write_bytes(self.folder / PICTURES / f"{name}.png", png)
         if self.board is not None:
-            self.board.add_image(name, pixels, step, dataformats="HWC")
+            with _named(self.folder):
+                self.board.add_image(name, pixels, step, dataformats="HWC")
+
+    def _of_thread(self, what: threading.ExceptHookArgs) -> None:
+        """TensorBoard's writer is a thread: it meets a full disk first, the next call tells it."""
+        if not issubclass(what.exc_type, OSError):
+            self.hook(what)
 
     def close(self) -> None:
-        """Flush both."""
+        """Close both."""
         if self.file is not None:
-            self.file.close()
+            with suppress(OSError):  # every line was flushed: what remains was said not to fit
+                self.file.close()
         if self.board is not None:
-            self.board.close()
+            with suppress(OSError):
+                self.board.close()
+        threading.excepthook = self.hook
+
+
+@contextmanager
+def _named(path: object) -> Iterator[None]:
+    """A full disk is told with the name of what did not fit."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _continued(path: Path, step: int) -> TextIO:
@@ -133,7 +159,8 @@ def _board(folder: Path, step: int) -> Any:  # noqa: ANN401 - None, or a writer 
         return None
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(folder), purge_step=step or None)
+    with _named(folder):
+        return SummaryWriter(str(folder), purge_step=step or None)
 
 
 BAD_BATCH = "bad-batch.safetensors"

@@ -274,13 +274,18 @@ class Info:
 
     def run(self, console: Console) -> int:
         """Print counts, histograms and digests of every split; 1 if a shard is damaged."""
-        from scapo.store import Split
+        from scapo.store import Split, StoreError
         from sim_assets.describe.info import describe_split, find_splits
         from sim_assets.inspect.variation import Variation
 
         whole, variation = True, Variation(self.source)
         for folder in find_splits(self.path):
-            split = Split(folder)
+            try:
+                split = Split(folder)
+            except StoreError as error:
+                say(console, error, label="DAMAGED", style="red")
+                whole = False
+                continue
             report = describe_split(split)
             lines = [report.text, *variation.lines(split)]
             console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)

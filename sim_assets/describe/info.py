@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,11 @@ def find_splits(path: Path) -> list[Path]:
     Raises:
         StoreError: There is none.
     """
-    found = sorted(manifest.parent for manifest in path.rglob("manifest.json"))
+    found = sorted(
+        Path(folder)
+        for folder, below, names in os.walk(path)  # which names links to nothing too
+        if "manifest.json" in (*names, *below)
+    )
     if not found:
         raise StoreError(f"{path}: expected a data set (manifest.json), found none")
     return found

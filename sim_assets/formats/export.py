@@ -27,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 
 from scapo.store import Arrays, Split
-from scapo.store.folders import whole_folder
+from scapo.store.folders import refuse_inside, whole_folder
 from scapo.store.manifest import Manifest
 
 FORMAT = "scapo-export/1"
@@ -69,9 +69,11 @@ def export(root: Path, splits: Sequence[Path], out: Path, form: ExportFormat) ->
 
     Raises:
         StoreError: A split is damaged.
-        ValueError: Something else is in the way, or the format's library is not installed.
+        ValueError: Something else is in the way, `out` lies in the data set or around it, or the
+            format's library is not installed.
     """
     suffix, writer = _writers(form)
+    refuse_inside(out, root)
     done = []
     with whole_folder(out) as folder:
         for path in splits:

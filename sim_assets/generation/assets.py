@@ -15,6 +15,7 @@ from sim_assets import procedural
 from sim_assets.models.account import check_speaks
 from sim_assets.models.library import source_root
 from sim_assets.models.reader import find, instance_id, read, select
+from sim_assets.models.validate import AssetError
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import DataOptions
 
@@ -82,18 +83,21 @@ class UrdfAsset:
         """Read it.
 
         Raises:
-            AssetError: It cannot be used, and why.
+            AssetError: It cannot be used, and why; names files as seen from the source folder.
         """
-        thing = read(
-            self.urdf,
-            self.category,
-            up=self.up,
-            front=self.front,
-            scale=self.scale,
-            root=self.root,
-        )
-        if not self.any_model:
-            check_speaks(self.urdf, thing)
+        try:
+            thing = read(
+                self.urdf,
+                self.category,
+                up=self.up,
+                front=self.front,
+                scale=self.scale,
+                root=self.root,
+            )
+            if not self.any_model:
+                check_speaks(self.urdf, thing)
+        except AssetError as error:  # its words may stand in a manifest: equal on every machine
+            raise error.below(self.root) from error
         return thing
 
 

@@ -38,6 +38,7 @@ from sim_assets.generation.shard import (
     render_shard_alike,
 )
 from sim_assets.generation.workers import planned_workers
+from sim_assets.models.limits import CLOCK_SECONDS
 from sim_assets.options import DataOptions
 
 Progress = Callable[[str, int, int], None]
@@ -226,7 +227,7 @@ def _describe(
     running.progress("objects", 0, wanted)
     while waiting and len(found) < wanted:
         batch, waiting = waiting[: wanted - len(found)], waiting[wanted - len(found) :]
-        for outcome in pool.run(describe, batch):
+        for outcome in pool.run(describe, batch, within=CLOCK_SECONDS):
             name = outcome.job.name
             if outcome.result is not None:
                 found[name] = outcome.result

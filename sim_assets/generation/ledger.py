@@ -20,7 +20,7 @@ from typing import Any
 from scapo.store import canonical_json, sha256_file, write_bytes
 from scapo.store.json_records import StoreError, from_json, read_json
 from scapo.store.manifest import Instance, Manifest, ManifestError, read_manifest
-from scapo.store.regular import read_regular
+from scapo.store.regular import NOT_OWN, is_odd, read_regular
 from scapo.text import one_line
 from sim_assets.generation.assets import Asset
 from sim_assets.generation.plan import Entry
@@ -107,8 +107,9 @@ class Ledger:
         """
         os.close(self._lock)
         if isinstance(error, OSError):
+            where = error.filename or self.folder
             raise GenerateError(
-                f"{self.folder}: expected to be written to, found: {error.strerror or error}"
+                f"{where}: expected to be written, found: {error.strerror or error}"
             ) from error
 
     def entries(self, assets: Sequence[Asset]) -> tuple[tuple[Entry, ...], dict[str, str]] | None:
@@ -186,8 +187,11 @@ class Ledger:
                 )
             time.sleep(0.1)
             os.listdir(self.folder)  # noqa: PTH208 - makes an NFS client look again
-        with (self.folder / FINISHED).open("a") as file:
-            file.write(f"{shard.sha256}  {shard.file}\n")
+        try:
+            with (self.folder / FINISHED).open("a") as file:
+                file.write(f"{shard.sha256}  {shard.file}\n")
+        except OSError as error:  # a full disk is reported without a name
+            raise OSError(error.errno, error.strerror, str(self.folder / FINISHED)) from error
 
     def finish(self, manifest: Manifest, empty: Sequence[str]) -> None:
         """Write the manifest, then remove what was needed only until now."""
@@ -198,7 +202,7 @@ class Ledger:
     def _look(self) -> None:
         for path in self.folder.glob(".*.tmp"):  # of a run that was killed while writing
             path.unlink(missing_ok=True)
-        self._refuse_odd()
+        self._own()
         if (self.folder / "manifest.json").exists():
             try:
                 self.manifest = read_manifest(self.folder / "manifest.json")
@@ -221,13 +225,14 @@ class Ledger:
                     f"{self.folder}: expected an empty folder, found {found[0]} without a manifest"
                 )
 
-    def _refuse_odd(self) -> None:
-        """Records that are links lead to other people's files, pipes and devices nowhere."""
+    def _own(self) -> None:
+        """Refuse records that are links; one that others share, as backups do, is copied."""
         for path in (self.folder / name for name in ("manifest.json", PLAN, FINISHED)):
-            if path.is_symlink() or (path.exists() and not path.is_file()):
-                raise GenerateError(
-                    f"{path}: expected a file of its own, found a link, a folder or a device"
-                )
+            if is_odd(path):
+                raise GenerateError(f"{path}: {NOT_OWN}")
+        record = self.folder / FINISHED  # which is written on
+        if record.exists() and record.stat().st_nlink > 1:
+            write_bytes(record, read_regular(record))
 
     def _read_plan(self) -> _Plan:
         path = self.folder / PLAN

@@ -10,18 +10,21 @@ one of the nine categories are shown as that category (`KINDS`).
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from scapo.parallel.pool import AbstractPool
+from scapo.store.json_records import parse_json
+from scapo.store.regular import read_regular
 from sim_assets.generation.assets import UrdfAsset
 from sim_assets.generation.plan import Entry
 from sim_assets.generation.shard import describe
 from sim_assets.models.joints import words
 from sim_assets.models.library import find, instance_id, source_root
+from sim_assets.models.limits import CLOCK_SECONDS
+from sim_assets.models.validate import MAX_URDF_BYTES, refuse
 
 INDEX = "index.csv"
 KINDS: dict[str, tuple[str, ...]] = {
@@ -39,7 +42,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 about an upright edge is a safe, one whose door falls open about its lower edge an oven, furniture
 with a drawer a drawer. Boxes with flaps, staplers, buckets, taps and carts are none of the nine."""
 MAX_BYTES = 4 << 20
-"""Of a file that is asked."""
+"""Of the beginning of a file, which is asked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +60,7 @@ def real_models(path: Path) -> RealModels:
     """Every model of a folder by the category that it belongs to.
 
     Raises:
-        AssetError: There is no such folder, or no URDF in it.
+        AssetError: There is no such folder, or no URDF in it, or its index is no table.
     """
     root = source_root(path)
     listed = _index(root)
@@ -94,9 +97,10 @@ def readable(
     Raises:
         ValueError: None can.
     """
-    outcomes = {outcome.job.name: outcome for outcome in pool.run(describe, models)}
+    done = pool.run(describe, models, within=CLOCK_SECONDS)
+    outcomes = {outcome.job.name: outcome for outcome in done}
     refused = {
-        model.name: outcomes[model.name].reason.replace(f"{model.root}/", "")
+        model.name: outcomes[model.name].reason
         for model in models
         if outcomes[model.name].result is None
     }
@@ -116,14 +120,17 @@ def _said(urdf: Path, root: Path, listed: Mapping[tuple[str, ...], str]) -> Iter
     moving = ("hinge", "slider")
     yield " ".join(row[2] for row in rows if len(row) == 3 and row[1] not in moving)
     yield " ".join(folders) or root.resolve().name
-    named = re.search(r"<robot[^>]*\bname\s*=\s*[\"']([^\"']*)", _text(urdf))
+    tag = _text(urdf).partition("<robot")[2].partition(">")[0]
+    named = re.search(r"\bname\s*=\s*[\"']([^\"']*)", tag)
     yield named[1] if named else ""
 
 
 def _index(root: Path) -> dict[tuple[str, ...], str]:
     """(folder, id) -> category, of an index beside the models; empty where there is none."""
-    text = _text(root / INDEX)
-    rows = csv.DictReader(text.splitlines())
+    try:
+        rows = list(csv.DictReader(_text(root / INDEX).splitlines()))
+    except csv.Error as error:
+        raise refuse(root / INDEX, "a table with category and id", str(error)) from error
     return {
         (row["category"], row["id"]): row["category"]
         for row in rows
@@ -133,7 +140,7 @@ def _index(root: Path) -> dict[tuple[str, ...], str]:
 
 def _meta(path: Path) -> str:
     try:
-        data = json.loads(_text(path) or "{}")
+        data = parse_json(_text(path) or "{}")
     except (ValueError, RecursionError):
         return ""
     return str(data.get("model_cat", "")) if isinstance(data, dict) else ""
@@ -142,7 +149,6 @@ def _meta(path: Path) -> str:
 def _text(path: Path) -> str:
     """The beginning of a file; nothing where it cannot be read."""
     try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            return file.read(MAX_BYTES)
+        return read_regular(path, MAX_URDF_BYTES)[:MAX_BYTES].decode("utf-8-sig", "replace")
     except OSError:
         return ""

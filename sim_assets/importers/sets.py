@@ -17,13 +17,14 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 from scapo.export.urdf import write_urdf
 from scapo.parallel.pool import AbstractPool, Pool, Report
+from scapo.store.folders import refuse_inside
 from scapo.text import one_line
 from sim_assets.importers import hoi4d, op_align_light, op_align_real, shape2motion
 from sim_assets.importers import partnet_mobility as partnet_models
 from sim_assets.importers.clouds import CloudFile
 from sim_assets.importers.models import Folder, Model
 from sim_assets.importers.splits import CloudReader, SplitWriter, import_split
-from sim_assets.models.limits import bounded
+from sim_assets.models.limits import CLOCK_SECONDS, bounded
 
 SetName = Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "partnet-mobility"]
 Progress = Callable[[str, int, int], None]
@@ -162,7 +163,8 @@ def _models(reader: ModelReader, path: Path, out: Path, result: Imported, calls:
     refused = len(folders) - len(jobs)
     show("models", refused, len(folders))
     written: dict[Path, tuple[Path, tuple[str, ...]]] = {}
-    for done, outcome in enumerate(pool.run(write_model, jobs), refused + 1):
+    outcomes = pool.run(write_model, jobs, within=CLOCK_SECONDS)
+    for done, outcome in enumerate(outcomes, refused + 1):
         if outcome.result is None:
             refuse(outcome.job.folder.path, outcome.reason)
         else:
@@ -201,19 +203,6 @@ def _model_jobs(
         seen[target] = folder.name
         jobs.append(ModelJob(read=reader.read, folder=folder, target=target))
     return jobs
-
-
-def refuse_inside(target: Path, *sources: Path) -> None:
-    """Refuse a target that lies in what is read, or around it: it would overwrite originals.
-
-    Raises:
-        ValueError: Naming both.
-    """
-    place = Path(os.path.realpath(target))
-    for source in sources:
-        real = Path(os.path.realpath(source))  # a link in a circle is itself
-        if place == real or real in place.parents or place in real.parents:
-            raise ValueError(f"{target}: expected a place outside the source, found it in {source}")
 
 
 def _clouds(

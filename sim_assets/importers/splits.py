@@ -35,7 +35,7 @@ from sim_assets.describe.card import CARD, write_card
 from sim_assets.describe.croissant import CROISSANT
 from sim_assets.formats.archives import read_bytes
 from sim_assets.importers.clouds import CloudFile, RawCloud
-from sim_assets.models.limits import bounded
+from sim_assets.models.limits import CLOCK_SECONDS, bounded
 from sim_assets.models.validate import refuse
 from sim_assets.sampling.viewpoints import generator
 
@@ -256,7 +256,8 @@ def import_split(
         for start in range(0, len(files), SHARD_SAMPLES):
             chunk = files[start : start + SHARD_SAMPLES]
             jobs = [CloudJob(read=reader.read, file=f, points=writer.points) for f in chunk]
-            outcomes = {outcome.job.file.path: outcome for outcome in pool.run(read_sample, jobs)}
+            done = pool.run(read_sample, jobs, within=CLOCK_SECONDS)
+            outcomes = {outcome.job.file.path: outcome for outcome in done}
             for file in chunk:  # in their order, be one read again or not
                 result = outcomes[file.path].result
                 if result is None:

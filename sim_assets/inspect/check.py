@@ -23,7 +23,7 @@ from sim_assets.generation.request import make_request
 from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.joints import Candidate, candidates
 from sim_assets.models.library import find, source_root
-from sim_assets.models.limits import bounded, limited_memory
+from sim_assets.models.limits import CLOCK_SECONDS, bounded, limited_memory
 from sim_assets.models.reader import Model, load, read
 from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.validate import AssetError, Repairs, refuse
@@ -106,7 +106,7 @@ def check(
     results: dict[Path, Result] = {}
     pool: Pool[_Model, Result] = Pool(min(workers, len(models)), timeout=options.timeout)
     with pool:
-        for outcome in pool.run(_job, models):
+        for outcome in pool.run(_job, models, within=CLOCK_SECONDS):
             result = _result(outcome)
             results[outcome.job.urdf] = result
             if on_result is not None:
@@ -140,7 +140,7 @@ def _job(model: _Model, send: Report) -> Result:
     """In the worker."""
     send(one_line(model.urdf), 0)
     with limited_memory(model.options.memory):
-        return check_one(model.urdf, model.root, model.options)
+        return check_one(model.urdf, model.root, model.options, send)
 
 
 def _result(outcome: Outcome[_Model, Result]) -> Result:
@@ -151,10 +151,12 @@ def _result(outcome: Outcome[_Model, Result]) -> Result:
     if result is None:
         reason = f"{name}: expected to be read, found that {outcome.reason}"
         return Result(path=name, status="refused", reason=reason)
-    return replace(result, path=name, reason=result.reason.replace(f"{model.root}/", ""))
+    return replace(result, path=name)
 
 
-def check_one(urdf: Path, root: Path, options: Options) -> Result:
+def check_one(
+    urdf: Path, root: Path, options: Options, send: Report = lambda label, amount: None
+) -> Result:
     """Check one model in this process; refusals are results, other errors are raised."""
     repairs = Repairs()
     told: tuple[str, ...] = ()
@@ -173,12 +175,13 @@ def check_one(urdf: Path, root: Path, options: Options) -> Result:
             )
             if not options.any_model:
                 check_speaks(urdf, thing)
+            send(one_line(urdf), 0)  # that reading it is over
             show(urdf, thing)
             told = sentences(thing)
             joints, said = thing.origin.joint_names, thing.origin.repairs
             triangles = sum(len(visual.mesh.faces) for part in thing.visuals for visual in part)
     except AssetError as error:
-        reason, said = str(error), repairs.sentences()
+        reason, said = str(error.below(root)), repairs.sentences()
         return Result(path=str(urdf), status="refused", reason=reason, repairs=said)
     status: Status = "repaired" if said else "accepted"
     return Result(
@@ -203,7 +206,7 @@ def show(urdf: Path, thing: ArticulatedObject) -> None:
             list(SampleMaker(renderer, thing, request.settings).render_views([("check",)]))
         except ViewError as error:
             reason = str(error).removeprefix(f"{thing.instance}: expected ")
-            raise AssetError(f"{urdf}: expected {reason}") from error
+            raise AssetError(urdf, f"expected {reason}") from error
 
 
 def _general(urdf: Path, root: Path, repairs: Repairs) -> tuple[tuple[str, ...], int]:

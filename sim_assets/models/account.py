@@ -80,7 +80,7 @@ def check_speaks(path: Path, thing: ArticulatedObject) -> None:
     found = ", ".join(told.names[:SHOWN])
     expected = f"a link, joint or semantics that speaks of the category {thing.category.name!r}"
     error = refuse(path, f"{expected} ({wanted})", found)
-    raise AssetError(f"{error} (--any-model takes it all the same)")
+    raise AssetError(path, f"{error.words} (--any-model takes it all the same)")
 
 
 def sentences(thing: ArticulatedObject) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ Where no limit will do, zero is taken if it comes within 10 %.
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from math import pi, radians
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from scapo.categories import Category, JointSpec
@@ -46,6 +47,8 @@ LONGEST = {"revolute": 4 * pi, "prismatic": 3.0}
 """rad; asset diagonals."""
 SHORTEST = {"revolute": radians(5.0), "prismatic": 0.01}
 """rad; asset diagonals. Knobs and buttons travel less."""
+MAX_PRODUCTS = 1 << 25
+"""Numbers that are computed at once: a quarter of a gigabyte."""
 MAX_PAIRED = 16
 """Of so many best candidates pairs are formed."""
 
@@ -425,4 +428,13 @@ def hull_points(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
         z, turn = 1 - 2 * k / 1024, pi * (1 + 5**0.5) * k
         ring = np.sqrt(1 - z * z)
         directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
-        return points[np.unique((points @ directions.T).argmax(0))]
+        return points[farthest(points, directions.T)]
+
+
+def farthest(
+    points: Float[np.ndarray, "N 3"], directions: Float[np.ndarray, "3 D"]
+) -> Int[np.ndarray, " U"]:
+    """The points that lie farthest along some direction; some directions at a time where many."""
+    blocks = math.ceil(points.shape[0] * directions.shape[1] / MAX_PRODUCTS)
+    found = [(points @ some).argmax(0) for some in np.array_split(directions, blocks, axis=1)]
+    return np.unique(np.concatenate(found))

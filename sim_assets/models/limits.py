@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
+
 from sim_assets.formats.pickled import UnpickleError
 from sim_assets.models.validate import AssetError, refuse
 
@@ -22,11 +24,16 @@ try:
 except ImportError:  # Windows
     resource = None
 
-READ_MEMORY = 1 << 30
-"""Bytes that reading one asset may take beyond what the process has."""
+READ_MEMORY = 3 << 29
+"""Bytes that reading one asset may take beyond what the process has: with that below two gibibytes.
+A million triangles take two thirds of them, in COLLADA the most."""
 READ_SECONDS = 20.0
 """Processor seconds that reading one asset may take: not the clock's, so that a busy machine
-refuses nothing that an idle one accepts. An STL of 2.6 million triangles takes a third of them."""
+refuses nothing that an idle one accepts. An STL of a million triangles takes a third of them."""
+CLOCK_SECONDS = 30.0
+"""Seconds by the clock after which a worker that reads an asset for the first time is ended. If it
+had the processor for most of them the asset is refused; else the machine was slow, and the asset is
+read again after the others, for as long as `--timeout` allows."""
 TICK = 0.5
 """Processor seconds between looks at the clock."""
 
@@ -52,7 +59,8 @@ def bounded(path: Path, memory: int = READ_MEMORY) -> Iterator[None]:
         return
     _bounded.active = True
     try:
-        with _timed() as is_late, limited_memory(memory):
+        # Numbers that overflow are refused by their values, not by lines of warnings.
+        with _timed() as is_late, limited_memory(memory), np.errstate(all="ignore"):
             try:
                 yield
             except Exception:
@@ -64,17 +72,18 @@ def bounded(path: Path, memory: int = READ_MEMORY) -> Iterator[None]:
     except (AssetError, UnpickleError):
         raise
     except (Exception, _TooLongError) as error:
-        raise refuse(path, *_words(error, memory)) from error
+        raise refuse(path, *_words(path, error, memory)) from error
     finally:
         _bounded.active = False
 
 
-def _words(error: BaseException, memory: int) -> tuple[str, str]:
+def _words(path: Path, error: BaseException, memory: int) -> tuple[str, str]:
     """What was expected, and what was found."""
     if isinstance(error, _TooLongError):
         return f"to be read in {READ_SECONDS:g} s", "that it takes longer"
     if isinstance(error, MemoryError):
-        return f"to be read in {memory >> 20} MiB of memory", f"MemoryError {error}"
+        hint = ", as a million triangles are" if path.suffix == ".urdf" else ""
+        return f"to be read in {memory >> 20} MiB of memory{hint}", f"MemoryError {error}"
     if isinstance(error, RecursionError):
         return "contents of sane depth", "deeper ones"
     return "to be read", f"{type(error).__name__}: {error}"

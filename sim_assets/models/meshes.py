@@ -10,6 +10,8 @@ import io
 import math
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 
 from sim_assets.models.resolver import MeshResolver, SourceFiles
 from sim_assets.models.robot import Color, Robot, Shape, ShapeKind
-from sim_assets.models.sides import two_sided
+from sim_assets.models.sides import two_sided, used_vertices
 from sim_assets.models.textures import find_image, is_readable, only_pictures
 from sim_assets.models.validate import MAX_COORDINATE, MAX_FACES, AssetError, check_mesh, refuse
 from sim_assets.objects import Visual
@@ -27,6 +29,8 @@ from sim_assets.objects import Visual
 SAGITTA = 5e-5
 """Largest distance of the mesh from the true surface, relative to the radius."""
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
+MIN_SIZE = 1e-9
+"""Asset units."""
 GREY: Color = (0.7, 0.7, 0.7, 1.0)
 
 
@@ -86,7 +90,7 @@ def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
         raise refuse(path, "a mesh with triangles", "none")
     for piece in pieces:
         check_mesh(path, piece.mesh)
-    return _both_sides(pieces, _unit(units))
+    return _both_sides(pieces, _unit(path, units))
 
 
 def _claimed_faces(form: str, data: bytes) -> int:
@@ -104,15 +108,14 @@ def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[
     """Pieces in the scene's frame, and its units; whatever a loader raises is a refusal."""
     where, repairs = resolver.mesh.name, resolver.files.repairs
     try:
-        with warnings.catch_warnings(), only_pictures(lambda why: repairs.add(why, where)):
-            warnings.simplefilter("ignore")
+        with _silent(), only_pictures(lambda why: repairs.add(why, where)):
             scene = trimesh.load_scene(
                 io.BytesIO(data), file_type=form, resolver=resolver, process=False
             )
             _check_textures(scene, resolver)
             meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
             return [_piece(mesh) for mesh in meshes if len(mesh.faces)], str(scene.units)
-    except AssetError:
+    except (AssetError, MemoryError):
         raise
     except ImportError as error:
         package = {"dae": "pycollada"}.get(form, str(error.name))
@@ -121,6 +124,19 @@ def _parse(path: Path, form: str, data: bytes, resolver: MeshResolver) -> tuple[
         raise refuse(path, f"a valid {form} file", "nodes nested too deeply") from error
     except Exception as error:
         raise refuse(path, f"a valid {form} file", f"{type(error).__name__}: {error}") from error
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Without what the loaders print of what they leave out: it is said in our words."""
+    logger = trimesh.util.log
+    before, logger.disabled = logger.disabled, True
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.disabled = before
 
 
 def _check_textures(scene: trimesh.Scene, resolver: MeshResolver) -> None:
@@ -178,10 +194,13 @@ def _both_sides(pieces: list[Visual], scale: float) -> list[Visual]:
     return result
 
 
-def _unit(units: str) -> float:
+def _unit(path: Path, units: str) -> float:
     """Metres per unit: trimesh writes a dae's as "0.0254 * meters"; other formats are as URDF."""
-    found = re.match(r"^([0-9.eE+-]+) \* meters$", units)
-    return float(found[1]) if found else 1.0
+    found = re.match(r"^(\S+) \* meters$", units)
+    scale = float(found[1]) if found else 1.0
+    if not 0 < scale < math.inf:
+        raise refuse(path, "a unit of some length", f"{scale:g} m")
+    return scale
 
 
 def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visual:
@@ -194,8 +213,11 @@ def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visu
             faces = faces[:, ::-1]
     pose = shape.link_T_shape
     moved = vertices @ pose[:3, :3].T + pose[:3, 3]
-    if not (np.abs(moved[np.unique(faces)]) <= MAX_COORDINATE).all():
+    used = used_vertices(faces)
+    if not (np.abs(moved[used]) <= MAX_COORDINATE).all():
         raise refuse(files.urdf, f"{where}: coordinates below {MAX_COORDINATE:g}", "larger ones")
+    if not np.ptp(moved[used], axis=0).max() > MIN_SIZE:
+        raise refuse(files.urdf, f"{where}: a shape larger than {MIN_SIZE:g}", "a smaller one")
     mesh = remade(piece.mesh, moved, faces)
     if shape.color is None:
         return Visual(mesh=mesh, color=piece.color)

@@ -260,7 +260,7 @@ def _axis(reader: _Reader, element: Element, kind: str, where: str) -> Float[np.
         return np.array([1.0, 0.0, 0.0])
     axis = np.array(reader.numbers(found.get("xyz", "1 0 0"), (3,), f"{where} axis"))
     length = float(np.linalg.norm(axis))
-    if length < 1e-9:
+    if not 1e-9 <= length < math.inf:
         raise reader.error(where, "an axis with a length", f"{found.get('xyz')!r}")
     if abs(length - 1) > 1e-4:
         reader.repairs.add("An axis was brought to length 1", where)

@@ -40,6 +40,7 @@ from sim_assets.models.meshes import load_links, remade
 from sim_assets.models.parse import parse
 from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.robot import Robot
+from sim_assets.models.sides import used_vertices
 from sim_assets.models.sources import Traits, traits
 from sim_assets.models.validate import Repairs, check_object, check_poses, check_robot, refuse
 from sim_assets.objects import Account, ArticulatedObject, Origin, Visual
@@ -78,7 +79,8 @@ class _Resting:
 
     def points(self, part: int) -> Float[np.ndarray, "N 3"]:
         """Vertices that a part's triangles use."""
-        return np.concatenate([v.mesh.vertices[np.unique(v.mesh.faces)] for v in self.parts[part]])
+        meshes = [visual.mesh for visual in self.parts[part]]
+        return np.concatenate([mesh.vertices[used_vertices(mesh.faces)] for mesh in meshes])
 
 
 def read(

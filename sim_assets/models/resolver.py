@@ -13,6 +13,7 @@ from trimesh.resolvers import Resolver
 
 from sim_assets.models.validate import MAX_MESH_BYTES, Repairs, read_file, refuse
 
+MAX_MATERIALS = 10_000
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+)://?(.*)$", re.DOTALL)
 _DRIVE = re.compile(r"^[A-Za-z]:[/\\]")
 
@@ -140,7 +141,11 @@ class MeshResolver(Resolver):
             if clean.suffix.lower() != ".mtl":
                 self.files.repairs.add("A file that a mesh names is not there", str(key))
             raise FileNotFoundError(str(key))
-        return self.files.read(path)
+        data = self.files.read(path)
+        if data.count(b"newmtl") > MAX_MATERIALS:  # a loader opens the picture of each
+            self.files.repairs.add(f"Materials were left out of a file of over {MAX_MATERIALS}")
+            raise FileNotFoundError(str(key))
+        return data
 
     def namespaced(self, namespace: str) -> MeshResolver:
         """The same for a folder below."""

@@ -54,7 +54,35 @@ def _weld(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
     """One number per place: vertices that agree to a millionth of the size are one."""
     size = float(np.ptp(vertices, axis=0).max()) or 1.0
     places = np.round(vertices / (size * 1e-6)).astype(np.int64)
-    return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+    return number_rows(places)
+
+
+def used_vertices(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " U"]:
+    """The indices that faces name, in order: `np.unique` in a fraction of its time."""
+    used = np.zeros(int(faces.max()) + 1 if len(faces) else 0, bool)
+    used[faces] = True
+    return np.flatnonzero(used)
+
+
+def number_rows(rows: Int[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
+    """The place of each row among the different ones, in order.
+
+    As `np.unique(rows, axis=0, return_inverse=True)[1]`, in a tenth of the time.
+
+    >>> number_rows(np.array([[2, 0, 1], [-1, 5, 5], [2, 0, 1]])).tolist()
+    [1, 0, 1]
+    """
+    if not len(rows):
+        return np.zeros(0, np.int64)
+    x, y, z = (column - column.min() for column in rows.T)
+    if max(x.max(), y.max(), z.max()) < 1 << 21:  # one number of 63 bits, in the same order
+        return np.unique((x << 42) | (y << 21) | z, return_inverse=True)[1].reshape(-1)
+    order = np.lexsort((z, y, x))
+    ordered = rows[order]
+    starts = np.concatenate([[False], (ordered[1:] != ordered[:-1]).any(1)])
+    result = np.zeros(len(rows), np.int64)
+    result[order] = np.cumsum(starts)
+    return result
 
 
 def _shells(
@@ -105,8 +133,7 @@ def fronts_and_backs(
         Two faces each; the second is -1 where none looks that way.
     """
     forward, backward = _wound(_weld(vertices)[faces])
-    group = np.unique(np.concatenate([forward, backward]), axis=0, return_inverse=True)[1]
-    front, back = group.reshape(2, -1)
+    front, back = number_rows(np.concatenate([forward, backward])).reshape(2, -1)
     worst_first = np.lexsort((np.arange(len(faces)), second))[::-1]
     best = np.full(2 * len(faces), -1)
     best[front[worst_first]] = worst_first
@@ -116,8 +143,7 @@ def fronts_and_backs(
 def are_added_reverses(faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
     """Faces of one mesh whose reverse, over the same vertices, comes before them."""
     forward, backward = _wound(faces)
-    group = np.unique(np.concatenate([forward, backward]), axis=0, return_inverse=True)[1]
-    front, back = group.reshape(2, -1)
+    front, back = number_rows(np.concatenate([forward, backward])).reshape(2, -1)
     first = np.full(2 * len(faces), len(faces))
     np.minimum.at(first, front, np.arange(len(faces)))
     return first[back] < np.arange(len(faces))
@@ -127,8 +153,7 @@ def _without_reverse(faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
     """Faces whose mirror twin (the same corners run the other way) is not in the mesh."""
     if len(faces) == 0:
         return np.zeros(0, bool)
-    both = np.concatenate(_wound(faces))
-    group = np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)
+    group = number_rows(np.concatenate(_wound(faces)))
     return ~np.isin(group[len(faces) :], group[: len(faces)])
 
 

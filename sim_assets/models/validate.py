@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from jaxtyping import Float
 from scapo.store.regular import read_regular
 from scapo.text import one_line
 from sim_assets.models.robot import MOVABLE, Joint, Robot
+from sim_assets.models.sides import used_vertices
 from sim_assets.objects import ArticulatedObject
 
 MAX_URDF_BYTES = 32 << 20
@@ -30,8 +32,9 @@ MAX_CHAIN = 64
 """Joints that mimic one another in a row."""
 MAX_WORDS = 300
 """Characters of what was expected, and of what was found."""
-MAX_FACES = 5_000_000
-"""Triangles of a whole asset: a 2.6 million triangle STL still loads in seconds."""
+MAX_FACES = 2_500_000
+"""Triangles of a whole asset, both sides of open surfaces counted: about twice as many as can be
+read in the memory that `limits` allows."""
 MAX_COORDINATE = 1e5
 """Asset units; beyond it float32 pictures lose the millimetre even for models in millimetres."""
 
@@ -39,11 +42,26 @@ MAX_COORDINATE = 1e5
 class AssetError(ValueError):
     """The asset cannot be used: `path: expected, found`."""
 
+    def __init__(self, path: Path, words: str) -> None:
+        """The file, and what was expected and found: one line, however long a value is."""
+        self.path, self.words = path, words
+        super().__init__(f"{one_line(path, 2 * MAX_WORDS)}: {words}")
+
+    def below(self, root: Path) -> AssetError:
+        """The same error, which names the file as seen from the source folder, wherever that is."""
+        words = self.words
+        for top in dict.fromkeys((root.absolute(), root.resolve(), root)):
+            words = words.replace(f"{one_line(top)}/", "")
+        for path, top in ((self.path.absolute(), root.absolute()), (self.path, root.resolve())):
+            with suppress(ValueError):
+                return AssetError(path.relative_to(top), words)
+        return AssetError(self.path, words)
+
 
 def refuse(path: Path, expected: str, found: str) -> AssetError:
-    """The error to raise, worded alike everywhere; one line, however long a value is."""
+    """The error to raise, worded alike everywhere."""
     words = (one_line(text, MAX_WORDS) for text in (expected, found))
-    return AssetError(one_line(path, 2 * MAX_WORDS) + ": expected {}, found {}".format(*words))
+    return AssetError(path, "expected {}, found {}".format(*words))
 
 
 def read_file(path: Path, limit: int) -> bytes:
@@ -209,7 +227,7 @@ def check_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
             f"vertex indices below {len(mesh.vertices)}",
             f"{mesh.faces.min()} to {mesh.faces.max()}",
         )
-    chosen = np.unique(mesh.faces)
+    chosen = used_vertices(mesh.faces)
     used = mesh.vertices[chosen]
     if not np.isfinite(used).all():
         row = int(np.flatnonzero(~np.isfinite(used).all(1))[0])

@@ -27,6 +27,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scapo.categories import Window
 from scapo.geometry.camera import Intrinsics
+from sim_assets.models.joints import farthest
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import PresetName, Protocol
 from sim_assets.sampling import presets
@@ -105,7 +106,8 @@ class Outline:
 
 def hull_points(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "_ 3"]:
     """The points on the convex hull; all distinct points where they lie in a plane."""
-    distinct = np.unique(points, axis=0)
+    ordered = points[np.lexsort(points.T[::-1])]
+    distinct = ordered[np.concatenate([[True], (ordered[1:] != ordered[:-1]).any(1)])]
     try:
         return distinct[ConvexHull(distinct).vertices]
     except (QhullError, ValueError):
@@ -123,7 +125,7 @@ def outermost(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "_ 3"]:
     turn = np.pi * (1 + np.sqrt(5)) * index  # a spiral with the golden angle
     level = np.sqrt(1 - z * z)
     directions = np.stack([level * np.cos(turn), level * np.sin(turn), z])
-    return points[np.unique((points @ directions).argmax(0))]
+    return points[farthest(points, directions)]
 
 
 def draw_preset_views(

@@ -27,28 +27,33 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="fuzz", description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--only", nargs="*", default=list(FORMATS), choices=list(FORMATS))
     options = parser.parse_args()
     counts = {name: Counter[str]() for name in options.only}
     until, first, bad = time.monotonic() + options.seconds, options.first, []
-    with tempfile.TemporaryDirectory() as place, Pool[Any, Any](2, timeout=TIMEOUT) as pool:
+    with (
+        tempfile.TemporaryDirectory() as place,
+        Pool[Any, Any](options.workers, timeout=TIMEOUT) as pool,
+    ):
         while time.monotonic() < until:
             for outcome in pool.run(play_batch, [(name, place, first) for name in options.only]):
                 name = outcome.job[0]
                 if outcome.result is None:
                     counts[name]["died"] += 1
-                    bad.append(f"{name}: {outcome.label}: {outcome.reason}")
+                    bad.append(f"{outcome.label}: {outcome.failure}: {outcome.reason}")
+                    print(bad[-1], flush=True)  # noqa: T201 - a long run may be broken off
                     continue
                 for number, (verdict, words) in outcome.result.items():
                     counts[name][verdict] += 1
                     if verdict not in ("read", "refused"):
                         bad.append(f"{name} {number}: {verdict}: {words}")
+                        print(bad[-1], flush=True)  # noqa: T201
             first += BATCH
     print(f"{'format':18}{'tried':>8}" + "".join(f"{column:>14}" for column in COLUMNS))  # noqa: T201
     for name, count in counts.items():
         row = "".join(f"{count[column]:14}" for column in COLUMNS)
         print(f"{name:18}{count.total():8}{row}")  # noqa: T201
-    print("\n".join(bad))  # noqa: T201
     return 1 if bad else 0
 
 

@@ -55,10 +55,14 @@ class Game:
 
     def play(self, number: int) -> Finding:
         """Try a case."""
-        for path, data in self.good.items():
-            if not path.exists() or path.read_bytes() != data:
-                path.write_bytes(data)
-        self.file.write_bytes(self.damaged(number))
+        return self.attempt(self.damaged(number))
+
+    def attempt(self, data: bytes) -> Finding:
+        """Read the file with these bytes."""
+        for path, good in self.good.items():
+            if not path.exists() or path.read_bytes() != good:
+                path.write_bytes(good)
+        self.file.write_bytes(data)
         begun = time.process_time()
         finding = judge(self.format, self.file)
         if time.process_time() - begun > SECONDS:

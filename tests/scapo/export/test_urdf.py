@@ -158,7 +158,7 @@ def test_a_failed_write_leaves_the_old_folder(tmp_path: Path, monkeypatch: pytes
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("scapo.export.urdf.urdf_text", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OSError, match=r"No space left on device: '.*/robot'"):
         write_urdf(tmp_path / "robot", links, joints)
     assert [p.name for p in tmp_path.iterdir()] == ["robot"]
     assert (tmp_path / "robot/mobility.urdf").is_file()

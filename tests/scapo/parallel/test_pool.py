@@ -10,7 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from scapo.parallel.pool import ONE_THREAD, TRIES, Pool, _cause, describe_error
+from scapo.parallel.pool import (
+    ONE_THREAD,
+    TRIES,
+    Pool,
+    _cause,
+    _processor_seconds,
+    describe_error,
+)
 
 
 def act(job: tuple[str, int], report) -> object:
@@ -156,3 +163,39 @@ def test_errors_in_one_line():
     assert describe_error(OSError(28, "No space left on device")) == (
         "[Errno 28] No space left on device"
     )
+
+
+def spin_or_wait(job: tuple[Path, str], report) -> str:
+    """Take the processor without end; or wait, the first time."""
+    log, verb = job
+    report(verb, 1)
+    with log.open("a") as file:
+        file.write(f"{verb}\n")
+    while verb == "spin":
+        pass
+    if log.read_text().split().count(verb) == 1:
+        time.sleep(600)
+    return verb
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="the system does not tell")
+def test_who_spins_is_at_fault_and_who_waits_is_not(tmp_path: Path):
+    """The first attempt has `within` seconds; a slow machine has the pool's timeout after it."""
+    log = tmp_path / "log"
+    with Pool(1, timeout=60) as pool:
+        jobs = [(log, "wait"), (log, "spin")]
+        waited = list(pool.run(spin_or_wait, jobs[:1], within=1.0))
+    assert [(o.result, o.failure) for o in waited] == [("wait", None)]
+    with Pool(1, timeout=5.0) as pool:
+        (spun,) = pool.run(spin_or_wait, jobs[1:], within=2.0)
+    assert (spun.failure, spun.label) == ("hung", "spin")
+    assert spun.reason in ("no sign of life for 2 s", "no sign of life for 5 s")  # machine busy
+    assert log.read_text().split().count("wait") == 2
+
+
+def test_processor_time_is_that_of_the_process():
+    begun, ours = time.process_time(), _processor_seconds(os.getpid())
+    while time.process_time() < begun + 0.3:
+        sum(range(1000))
+    assert 0.2 < _processor_seconds(os.getpid()) - ours < 10
+    assert _processor_seconds(2**30) == 0.0

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import json
+import os
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from scapo.store.files import read, read_header, require, write
+from scapo.store.files import read, read_header, require, sha256_file, write
 from scapo.store.schema import StoreError
 
 HEADER = {"format": "scapo-test/1", "list": [1, 2.5, None], "text": "Größe 尺"}
@@ -116,3 +119,26 @@ def test_require_names_the_first_missing_tensor(path: Path) -> None:
     require(path, ("a",), ("a", "b"))
     with pytest.raises(StoreError, match=r"a.safetensors: expected tensor 'c', found none"):
         require(path, ("a", "c", "d"), ("a", "b"))
+
+
+def test_tensors_of_terabytes_are_refused_unread(path: Path) -> None:
+    """A sparse file of no blocks; what is not asked for may be there."""
+    write(path, {"x": np.ones(2, np.float32)}, HEADER)
+    data = path.read_bytes()
+    size = struct.unpack("<Q", data[:8])[0]
+    head = json.loads(data[8 : 8 + size])
+    end = 8 + (1 << 38)
+    head["huge"] = {"dtype": "F32", "shape": [1 << 36], "data_offsets": [8, end]}
+    text = json.dumps(head).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + data[8 + size :])
+    os.truncate(path, 8 + len(text) + end)
+    with pytest.raises(StoreError, match=r"a\.safetensors: expected at most \d+ numbers, "):
+        read(path)
+    assert read(path, names=("x",))[0]["x"].tolist() == [1.0, 1.0]
+
+
+def test_a_sparse_file_of_terabytes_has_no_digest(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)
+    with pytest.raises(StoreError, match=r"a\.safetensors: expected at most 4294967296 bytes"):
+        sha256_file(path)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Literal
 
 import pytest
 
-from scapo.store.json_records import StoreError, from_json, read_json
+from scapo.store.json_records import MAX_JSON, StoreError, from_json, read_json
 
 
 @dataclass(frozen=True)
@@ -114,3 +115,17 @@ def test_what_is_no_json_is_one_line(tmp_path: Path, data: bytes) -> None:
     path.write_bytes(data)
     with pytest.raises(StoreError, match=r"a.json: expected JSON, found"):
         read_json(path)
+
+
+def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    """Readers differ in which of the two counts."""
+    (tmp_path / "a").write_text('{"x": [{"count": 3, "b": 1, "count": 4}]}')
+    with pytest.raises(StoreError, match="a: expected JSON, found the key 'count' twice"):
+        read_json(tmp_path / "a")
+
+
+def test_a_file_of_many_megabytes_is_refused_unread(tmp_path: Path) -> None:
+    (tmp_path / "a").touch()
+    os.truncate(tmp_path / "a", MAX_JSON + 1)
+    with pytest.raises(StoreError, match="67108865 bytes, more than 67108864"):
+        read_json(tmp_path / "a")

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from dataclasses import MISSING, FrozenInstanceError, fields, replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from scapo.store.manifest import (
     read_manifest,
     shards_digest,
 )
+from scapo.store.split import open_split
 from tests.helpers.splits import edit_manifest, instance, write_split
 
 
@@ -231,7 +234,7 @@ def test_other_files_are_refused(folder: Path, data: bytes, message: str) -> Non
 def test_no_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     refuse(tmp_path, "expected a manifest, found no file")
     (tmp_path / "manifest.json").mkdir()
-    refuse(tmp_path, "expected JSON, found [Errno 21]")
+    refuse(tmp_path, "expected a file of its own, found a link, a folder or a device")
 
 
 def test_other_writers_may_have_a_digest_of_their_own(folder: Path) -> None:
@@ -247,3 +250,37 @@ def test_the_digest_is_over_the_hashes_in_order() -> None:
     # printf 'a\nb' | sha256sum
     expected = "7e18f737311b2dc3b2f269dd78396b0351f14fb66efa879f768cb23181883c78"
     assert shards_digest(both) == expected != shards_digest(both[::-1])
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling link", "pipe", "device"])
+def test_a_manifest_that_is_no_file_of_its_own_is_refused(kind: str, folder: Path) -> None:
+    path = folder / "manifest.json"
+    path.rename(folder / "other.json")
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to({"link": "other.json", "device": "/dev/zero"}.get(kind, "none"))
+    refuse(folder, "expected a file of its own, found a link, a folder or a device")
+    with pytest.raises(ManifestError, match="expected a file of its own"):
+        open_split(folder, split=folder.name)
+
+
+@pytest.mark.parametrize("name", ["category", "split"])
+@pytest.mark.parametrize("value", ["../../x", "/etc", "..", "", "a/b", "a\nb", "x" * 300])
+def test_names_of_folders_are_no_paths(name: str, value: str, folder: Path) -> None:
+    """An export would write outside of its folder."""
+    edit_manifest(folder, **{name: value})
+    refuse(folder, f"{name}: expected a folder's name, found")
+
+
+def test_a_shard_that_would_fill_the_memory_is_refused(folder: Path) -> None:
+    edit_manifest(folder, points=10**12)
+    refuse(folder, "expected at most 16777216 points, found 3 samples of 1000000000000")
+
+
+def test_a_manifest_of_very_many_objects_is_read_at_once(folder: Path, written: str) -> None:
+    first = json.loads(written)["instances"][0]
+    edit_manifest(folder, instances=[{**first, "id": str(k)} for k in range(3_000)])
+    begun = time.process_time()
+    assert len(read_manifest(folder / "manifest.json").instances) == 3_000
+    assert time.process_time() - begun < 10

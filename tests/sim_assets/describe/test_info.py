@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from sim_assets.__main__ import main
 from sim_assets.describe.info import describe_state, histogram
+from tests.helpers import made
 
 
 def test_a_histogram_in_one_line():
@@ -21,3 +24,19 @@ def test_states_in_words():
     assert describe_state(np.pi / 2, "revolute") == "90°"
     assert describe_state(0.123, "prismatic") == "12 cm"
     assert describe_state(float("nan"), "revolute") == "–"
+
+
+def test_a_damaged_split_costs_itself_alone(tmp_path, capsys):
+    made.make_data(tmp_path, count=4, train=3, points=16)
+    manifest = tmp_path / "laptop/test/manifest.json"
+    manifest.unlink()
+    manifest.symlink_to("nowhere")
+    with pytest.raises(SystemExit) as ended:
+        main(["info", str(tmp_path)])
+    assert ended.value.code == 1
+    lines = capsys.readouterr().out.splitlines()
+    damaged = [line for line in lines if line.startswith("DAMAGED")]
+    assert len(damaged) == 1
+    assert "laptop/test/manifest.json: expected a file of its own, found a link" in damaged[0]
+    assert any("split train" in line for line in lines)
+    assert any("all whole" in line for line in lines)

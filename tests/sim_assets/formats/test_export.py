@@ -181,3 +181,15 @@ def test_parquet_says_that_pyarrow_is_missing(data: Path, tmp_path: Path, monkey
     assert run("export", data, "--format", "parquet", "--out", tmp_path / "out") == 1
     assert "expected pyarrow, found none (pip install 'scapo[export]')" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("place", [".", "export", "clean/eyeglasses/x", "../link/x", ".."])
+def test_an_export_lies_outside_of_the_data(place: str, tmp_path: Path, capsys):
+    """Its manifests would be taken for splits of the data set."""
+    root = tmp_path / "data"
+    write_split(root, "laptop", "train", sample_arrays("laptop", 3, 16))
+    (tmp_path / "link").symlink_to(root)
+    before = sorted(root.rglob("*"))
+    assert run("export", root, "--format", "npz", "--out", root / place) == 1
+    assert "expected a place outside the source" in capsys.readouterr().err.replace("\n", " ")
+    assert sorted(root.rglob("*")) == before

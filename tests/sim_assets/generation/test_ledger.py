@@ -85,3 +85,14 @@ def test_a_plan_of_other_objects_is_refused(tmp_path: Path):
     with pytest.raises(GenerateError, match="expected the objects it was begun with") as caught:
         opened(tmp_path)
     assert len(str(caught.value)) < 600
+
+
+def test_a_record_that_a_backup_shares_is_not_written_on(tmp_path: Path):
+    folder, backup = tmp_path / "split", tmp_path / "backup"
+    begun(folder)
+    (folder / FINISHED).write_text("")
+    os.link(folder / FINISHED, backup)
+    opened(folder)
+    with (folder / FINISHED).open("a") as file:
+        file.write("more")
+    assert backup.read_text() == ""

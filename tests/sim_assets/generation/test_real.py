@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -181,3 +183,19 @@ def test_every_such_model_goes_through(shared_dir: Path, tmp_path: Path, capsys)
         "real/drawer/test": 100,
         "real/scissors/test": 20,
     }
+
+
+def test_odd_files_beside_models_are_left_alone(tmp_path: Path):
+    """Pipes, tags without an end, a record that says nothing: the folder's name counts."""
+    for name in ("meta.json", "semantics.txt"):
+        cabinet(tmp_path / "oven" / name.partition(".")[0])
+        os.mkfifo(tmp_path / "oven" / name.partition(".")[0] / name)
+    cabinet(tmp_path / "oven/tags").write_text("<robot " * 500_000)
+    os.mkfifo(tmp_path / "index.csv")
+    begun = time.process_time()
+    assert sorted(found(tmp_path)["oven"]) == ["oven-meta", "oven-semantics", "oven-tags"]
+    assert time.process_time() - begun < 10
+    (tmp_path / "index.csv").unlink()
+    (tmp_path / "index.csv").write_text("category,id\noven," + "x" * 200_000 + "\n")
+    with pytest.raises(AssetError, match=r"index\.csv: expected a table with category and id"):
+        found(tmp_path)

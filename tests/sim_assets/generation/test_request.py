@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from sim_assets.generation.request import make_request
 from sim_assets.generation.shard import render_piece
 from sim_assets.generation.stream import stream
 from sim_assets.options import DataOptions
+from tests.helpers.urdfs import cabinet
 
 FULL = DataOptions(protocol="full", points=64, count=30, instances=5)
 """Needs no renderer."""
@@ -62,7 +65,7 @@ def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
     with pytest.raises(GenerateError, match=message):
         generate(request, assets, tmp_path / "split", {}, Running(workers=0))
     monkeypatch.setattr("sim_assets.generation.ledger.write_bytes", full)
-    with pytest.raises(GenerateError, match=r"other: expected to be written to, found: No space"):
+    with pytest.raises(GenerateError, match=r"other: expected to be written, found: No space"):
         generate(request, assets, tmp_path / "other", {}, Running(workers=0))
 
 
@@ -103,3 +106,32 @@ def test_how_models_are_read_is_no_question_of_procedural_objects(name):
     value = True if name == "any_model" else "z"
     with pytest.raises(ValueError, match="any_model: expected only with a --source folder"):
         make_request("laptop", replace(FULL, **{name: value}))
+
+
+def test_a_data_set_says_nothing_of_where_its_source_stood(tmp_path: Path):
+    """Whatever a model is left out for: what is written is equal byte for byte."""
+    written = []
+    for place in ("a", "a very long name, a link and a dot/./b"):
+        source = tmp_path / place / "models"
+        cabinet(source / "good")
+        cabinet(source / "no mesh", ("meshes/door.obj", "meshes/none.obj"))
+        cabinet(source / "bad mesh")
+        (source / "bad mesh/meshes/door.obj").write_text("v 0 0 nan\nf 1 1 1\n")
+        cabinet(source / "fixed", ('type="revolute"', 'type="fixed"'))
+        cabinet(source / "pipe")
+        (source / "pipe/cabinet.urdf").unlink()
+        os.mkfifo(source / "pipe/cabinet.urdf")
+        cabinet(source / "speaks of nothing", ("door", "leaf"))
+        if written:
+            (tmp_path / "link").symlink_to(source)
+            source = tmp_path / "link"
+        options = DataOptions(source=str(source), count=2, points=64, protocol="full")
+        request, assets = make_request("oven", options)
+        folder = tmp_path / f"out{len(written)}"
+        made = generate(request, assets, folder, {}, Running(workers=0))
+        assert set(made.failed) > {"fixed", "pipe"}
+        written.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    reasons = json.loads(written[0]["manifest.json"])["left_out"]
+    assert reasons["pipe"].startswith("pipe/cabinet.urdf: expected a readable file")
+    assert str(tmp_path) not in str(written)
+    assert written[0] == written[1]

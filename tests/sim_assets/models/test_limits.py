@@ -9,17 +9,19 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from scapo.parallel.pool import Pool
-from sim_assets.models import limits
+from sim_assets.models import joints, limits
 from sim_assets.models.limits import bounded, limited_memory
 from sim_assets.models.reader import read
 from sim_assets.models.validate import AssetError
 from tests.helpers.hostile import MODELS, picture_bomb
-from tests.helpers.urdfs import cabinet
+from tests.helpers.urdfs import BODY, cabinet
 
 SECONDS = 30
 BYTES = 2 << 30
@@ -131,3 +133,87 @@ def test_in_another_thread_only_the_memory_is_bounded():
     thread.start()
     thread.join()
     assert len(done) == 1
+
+
+def fine_box(sides: tuple[float, float, float], faces: int) -> trimesh.Trimesh:
+    """A box of about so many triangles, its corners moved a little so that no two are alike."""
+    count = round((faces / 12) ** 0.5)
+    step = np.linspace(-0.5, 0.5, count + 1)
+    flat = np.stack(np.meshgrid(step, step, indexing="ij"), -1).reshape(-1, 2)
+    first = (np.arange(count)[:, None] * (count + 1) + np.arange(count)).ravel()
+    a, b, c, d = first, first + count + 1, first + count + 2, first + 1
+    panel = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    points, corners = [], []
+    for axis in range(3):
+        for side in (-0.5, 0.5):
+            place = np.insert(flat, axis, side, axis=1)
+            points.append(place * sides)
+            turned = panel if (side > 0) == (axis != 1) else panel[:, ::-1]
+            corners.append(turned + (2 * axis + (side > 0)) * len(flat))
+    mesh = trimesh.Trimesh(np.concatenate(points), np.concatenate(corners), process=False)
+    mesh.merge_vertices()
+    noise = np.random.default_rng(0).normal(scale=1e-4, size=mesh.vertices.shape)
+    return trimesh.Trimesh(mesh.vertices + noise, mesh.faces, process=False)
+
+
+def large(folder: Path, form: str, faces: int) -> tuple[str, float, int]:
+    cabinet(folder, ("body.obj", f"body.{form}"))
+    fine_box(BODY, faces).export(folder / f"meshes/body.{form}")
+    with Pool(1, timeout=600) as pool:
+        (outcome,) = pool.run(measured_whole, [(folder, form)])
+    assert outcome.result is not None, outcome.reason
+    return outcome.result
+
+
+def measured_whole(job: tuple[Path, str], report) -> tuple[str, float, int]:
+    """As `measured`, with the time that users have."""
+    folder, name = job
+    report(name, 0)
+    begun = time.process_time()
+    thing = read(folder / "cabinet.urdf", "oven", root=folder)
+    count = sum(len(visual.mesh.faces) for part in thing.visuals for visual in part)
+    size = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return str(count), time.process_time() - begun, size
+
+
+@pytest.mark.parametrize("form", ["stl", "obj", "ply", "glb", "dae"])
+def test_a_good_model_of_many_triangles_is_read(form: str, tmp_path: Path):
+    count, _, size = large(tmp_path, form, 20_000)
+    assert int(count) == 12 * 41**2 + 12
+    assert size < BYTES
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["stl", "dae"])
+def test_a_good_model_of_a_million_triangles_is_read(form: str, tmp_path: Path):
+    count, seconds, size = large(tmp_path, form, 1_000_000)
+    assert int(count) > 990_000
+    assert seconds < limits.READ_SECONDS
+    assert size < BYTES
+
+
+def test_numbers_that_overflow_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+    cabinet(tmp_path, ('scale="1 1 1"', 'scale="1e300 1e300 1"'))
+    with pytest.raises(AssetError, match="coordinates below 100000"):
+        read(tmp_path / "cabinet.urdf", "oven", root=tmp_path)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_a_loader_leaves_out_is_not_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """A picture that is named and not there is a traceback in the loader's log."""
+    cabinet(tmp_path, ("body.obj", "body.ply"))
+    data: Any = trimesh.creation.box(BODY).export(file_type="ply", encoding="ascii")
+    head = b"format ascii 1.0\n"
+    named = data.replace(head, head + b"comment TextureFile /etc/passwd\n")
+    (tmp_path / "meshes/body.ply").write_bytes(named)
+    read(tmp_path / "cabinet.urdf", "oven", root=tmp_path)
+    assert not caplog.records
+
+
+def test_flat_parts_of_many_points_need_no_more_memory(monkeypatch: pytest.MonkeyPatch):
+    """Their outline is sought in some directions at a time; it stays the same."""
+    points = np.random.default_rng(0).normal(size=(500, 3)) * [1, 1, 0]
+    whole = joints.hull_points(points)
+    monkeypatch.setattr(joints, "MAX_PRODUCTS", 20_000)
+    assert np.array_equal(joints.hull_points(points), whole)
+    assert 5 < len(whole) < 100

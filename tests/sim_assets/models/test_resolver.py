@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_assets.models.resolver import MeshResolver, SourceFiles
+from sim_assets.models.resolver import MAX_MATERIALS, MeshResolver, SourceFiles
 from sim_assets.models.validate import AssetError, Repairs
 
 
@@ -84,3 +84,15 @@ def test_a_mesh_gets_its_side_files_and_no_others(files: SourceFiles):
             resolver.get(name)
     with pytest.raises(PermissionError, match="read only"):
         resolver.write("above.mtl", b"")
+
+
+def test_a_file_of_very_many_materials_is_left_out_and_said(files: SourceFiles):
+    """A loader opens the picture of each."""
+    resolver = MeshResolver(files, files.root / "robot/meshes/above.obj")
+    path = files.root / "robot/meshes/above.mtl"
+    path.write_text("newmtl m\n" * MAX_MATERIALS)
+    assert resolver.get("above.mtl") == path.read_bytes()
+    path.write_text("newmtl m\n" * (MAX_MATERIALS + 1))
+    with pytest.raises(FileNotFoundError):
+        resolver.get("above.mtl")
+    assert files.repairs.sentences() == ("Materials were left out of a file of over 10000",)

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from sim_assets.models.meshes import solid
-from sim_assets.models.sides import two_sided
+from sim_assets.models.sides import number_rows, two_sided, used_vertices
 
 
 def front_faces(
@@ -113,3 +113,15 @@ def test_solids_are_closed_centred_and_fine(kind: str, size: tuple[float, ...], 
         np.testing.assert_allclose(mesh.extents, (1, 1, 2), rtol=1e-4)
     if kind == "capsule":
         np.testing.assert_allclose(mesh.extents, (1, 1, 3), rtol=1e-4)
+
+
+@pytest.mark.parametrize("high", [3, 1 << 20, 1 << 40])
+def test_rows_are_numbered_as_numpy_does(high: int):
+    """Small numbers are packed into one, large ones sorted by column."""
+    rng = np.random.default_rng(high)
+    for count in (0, 1, 2, 500):
+        rows = rng.integers(-high, high, (count, 3))
+        rows[: count // 2] = rows[count - count // 2 :]
+        expected = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
+        assert np.array_equal(number_rows(rows), expected)
+        assert np.array_equal(used_vertices(abs(rows) % 1000), np.unique(abs(rows) % 1000))
