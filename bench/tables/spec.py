@@ -79,7 +79,6 @@ PUBLISHED = {
     "3dgcn": ("3DGCN", 10),
     "gcn3d": ("3DGCN", 10),
     "pointnet2": ("PointNet++", 20),
-    "npcs-epn": ("NPCS-EPN", 30),
 }
 """Methods that are not trained here: name in a predictions file -> what a table calls it, and its
 rank among the methods of `bench.methods`, which say the same of themselves."""
