@@ -104,7 +104,7 @@ class Eap(AbstractMethod):
     """The method, for one category."""
 
     name: ClassVar[str] = "eap"
-    networks = ("whole_stage", "part_stage")
+    networks = ("whole_stage.encoder", "part_stage.encoder", "part_stage.grouping")
     usual_base: Tensor
     usual_anchor: Tensor
 

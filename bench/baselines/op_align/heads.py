@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
 from scapo.equivariant.layers import ChannelNorm
-from scapo.geometry.numerics import at_least_float32
+from scapo.geometry.numerics import at_least_float32, exact
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import JointPairs, ResidualBlock
 from scapo.paper.vector_neurons import uniform
@@ -84,7 +84,8 @@ class HypothesisHead(nn.Module):
         x = self.feature(features)  # (B, K, width)
         axis, angle, translation = at_least_float32(self.residual(x)).split((3, 1, 3), -1)
         angle = 2 * RESIDUAL_RANGE * (torch.sigmoid(angle) - 0.5)
-        rotation = self.anchors @ rotvec_to_rotmat(F.normalize(axis, dim=-1) * angle)
+        with exact(angle.device.type):
+            rotation = self.anchors @ rotvec_to_rotmat(F.normalize(axis, dim=-1) * angle)
         attention = torch.softmax(at_least_float32(self.attention(x))[..., 0], -1)
         return Hypotheses(
             rotation=rotation,

@@ -11,14 +11,16 @@ import torch
 
 from bench.methods import METHODS
 from scapo.categories import CATEGORIES
-from scapo.method import AbstractMethod
+from scapo.method import AbstractMethod, Step
 from scapo.store.samples import TrainingData
 from scapo.training.fit import FitConfig, fit
+from scapo.training.precision import Arithmetic, applied
 from scapo.types import Labels
 from tests.bench.baselines.eap.test_method import TINY as EAP
 from tests.bench.baselines.op_align.test_method import TINY as OP_ALIGN
 from tests.helpers.hinged import plates
-from tests.helpers.strategies import generator
+from tests.helpers.small import settle
+from tests.helpers.strategies import generator, is_rotation
 
 CONFIGS = {"op-align": replace(OP_ALIGN, epochs=1), "eap": replace(EAP, epochs=(1, 1))}
 
@@ -47,3 +49,19 @@ def test_labels_change_neither_training_nor_prediction(name: str, tmp_path: Path
         assert answer.camera_T_part is not None
         assert torch.equal(answer.part_weight, one.part_weight)
         assert torch.equal(answer.camera_T_part, one.camera_T_part)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_networks_in_half_precision_leave_poses_whole(name: str) -> None:
+    method = settle(METHODS[name].build(CONFIGS[name], CATEGORIES["laptop"], generator(0)))
+    observation, _ = plates(6, 48)
+    with torch.no_grad(), applied(method, Arithmetic(precision="bfloat16"), "cpu"):
+        for stage in method.stages():
+            step = Step(stage=stage.name, progress=0.0, generator=generator(1),
+                        index=torch.arange(6), total=6)  # fmt: skip
+            terms = method.losses(observation, Labels(), step)
+            assert all(bool(torch.isfinite(term)) for term in terms.values())
+        answer = method.eval().predict(observation)
+    assert answer.camera_T_part is not None
+    assert answer.camera_T_part.dtype == torch.float32
+    assert is_rotation(answer.camera_T_part[..., :3, :3], 1e-5).all()
