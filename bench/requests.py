@@ -76,6 +76,40 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateRequest(Request):
+    """What to score, and whether what stands beside it in a table is scored too."""
+
+    out: Path
+    """Scores per sample, NAME.csv.gz; the report NAME.json is written beside it."""
+    companions: bool = True
+    """With the benchmark's readings: also score, for the tables, one part order for the whole data
+    set (NAME.one-order.csv.gz), the best of the turns that look alike where the data say so
+    (NAME.ambiguity.csv.gz), and a constant answer and one that is told the true base pose
+    (references/ beside NAME.csv.gz, where the data have the split train; kept while data and code
+    stay the same)."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferenceRequest:
+    """Which answers that are no method, on what."""
+
+    kind: tyro.conf.Positional[Literal["constant", "oracle-pose", "both"]]
+    """A constant answer, one that is told the true base pose, or both."""
+    data: Path
+    """Data set: the folder above CATEGORY/train and CATEGORY/SPLIT."""
+    category: str
+    """Category to predict."""
+    out: Path | None = None
+    """Predictions file (safetensors) of one of the two for evaluate."""
+    scores: Path | None = None
+    """Folder of scores: theirs are written to references/ there, as evaluate does by itself when
+    it scores a method."""
+    split: str = "test"
+    """Split to predict."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RunRequest:
     """A trained method and the data it is shown."""
 

@@ -5,9 +5,9 @@ A feature f(x, R_a) lives at points and anchors. Turned by an anchor g of the gr
 the same features elsewhere: f'(g x, g R_a) = f(x, R_a). A convolution over SE(3) is done in two:
 over space, with a kernel turned by each anchor, then over the group at each point.
 
-Not as published: the kernel's points are the icosahedron's (`levels`), where EPN has 24 of its
-own, so that 13 correlations serve all anchors in place of 60 x 24; the group convolution sees the
-12 least turns and the anchor itself, EPN the 12 alone.
+Not as published: the kernel's points are the icosahedron's (`levels`), where EPN has 24 or more of
+its own, so that 13 correlations serve all anchors in place of 60 x 24; the group convolution sees
+the anchor and the 12 least turns, EPN 12 anchors of the anchor's own and the adjoining faces.
 """
 
 from __future__ import annotations

@@ -33,6 +33,13 @@ FLAGS: dict[str, list[str]] = {
     ],
     "icp": ["--templates", "2", "--states", "1", "--part-points", "80", "--starts", "4"],
     "kiss-matcher": ["--templates", "2", "--states", "1", "--part-points", "80"],
+    "npcs-epn": [
+        "--preset", "cpu", "--epochs", "1", "--batch", "4", "--points", "64", "--draws", "20",
+        "--network.widths", "4", "8", "--network.strides", "4", "2",
+        "--network.radii", "0.3", "0.6",
+        "--network.neighbours", "6", "6", "--network.frames", "2", "--network.code", "8",
+        "--network.head", "16",
+    ],
     "pointnet2": [
         "--preset", "cpu", "--epochs", "1", "--batch", "4",
         "--centres", "16", "4", "--whole-widths", "32", "32",
