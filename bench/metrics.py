@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 
 from bench.matching import (
     LabelOrder,
@@ -48,7 +48,8 @@ class Metric:
 
     name: str
     per: Literal["part", "joint", "sample"]
-    higher_is_better: bool
+    higher_is_better: bool | None
+    """None: neither."""
     units: tuple[str, ...]
     """As in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
 
@@ -61,6 +62,7 @@ METRICS = (
     Metric(name="part_rotation", per="part", higher_is_better=False, units=("deg",)),
     Metric(name="part_translation", per="part", higher_is_better=False, units=("r4", "m")),
     Metric(name="reconstruction", per="sample", higher_is_better=False, units=("r4", "m")),
+    Metric(name="order", per="part", higher_is_better=None, units=("1",)),
 )
 
 
@@ -132,6 +134,8 @@ class Agreement:
     """The true part compared with each slot."""
     iou: Float[np.ndarray, "B P"]
     """In that order."""
+    answered: Bool[np.ndarray, " B"]
+    """Whether any point has a label."""
 
 
 def agree(
@@ -158,7 +162,8 @@ def agree(
     table = soft if iou == "soft" else overlap(counts, true_count, slot_count)
     value = table[np.arange(len(order))[:, None], order, np.arange(parts)]
     answered = np.asarray((label >= 0).any(1))
-    return Agreement(order=order, iou=np.where(answered[:, None], value, np.nan))
+    iou_ = np.where(answered[:, None], value, np.nan)
+    return Agreement(order=order, iou=iou_, answered=answered)
 
 
 def pose_errors(

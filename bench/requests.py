@@ -17,7 +17,7 @@ import tyro
 from bench.matching import LabelOrder
 from bench.metrics import ApRule, IouKind, PivotKind, RotationKind
 
-Mode = Literal["fast", "refine"]
+Mode = Literal["fast", "quick", "refine"]
 """`scapo.method.Mode`, written out: that module loads torch."""
 Precision = Literal["float32", "bfloat16", "float16"]
 """`scapo.training.precision.Precision`, likewise."""
@@ -76,6 +76,40 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateRequest(Request):
+    """What to score, and whether what stands beside it in a table is scored too."""
+
+    out: Path
+    """Scores per sample, NAME.csv.gz; the report NAME.json is written beside it."""
+    companions: bool = True
+    """With the benchmark's readings: also score, for the tables, one part order for the whole data
+    set (NAME.one-order.csv.gz), the best of the turns that look alike where the data say so
+    (NAME.ambiguity.csv.gz), and a constant answer and one that is told the true base pose
+    (references/ beside NAME.csv.gz, where the data have the split train; kept while data and code
+    stay the same)."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = field(default_factory=Settings)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferenceRequest:
+    """Which answers that are no method, on what."""
+
+    kind: tyro.conf.Positional[Literal["constant", "oracle-pose", "both"]]
+    """A constant answer, one that is told the true base pose, or both."""
+    data: Path
+    """Data set: the folder above CATEGORY/train and CATEGORY/SPLIT."""
+    category: str
+    """Category to predict."""
+    out: Path | None = None
+    """Predictions file (safetensors) of one of the two for evaluate."""
+    scores: Path | None = None
+    """Folder of scores: theirs are written to references/ there, as evaluate does by itself when
+    it scores a method."""
+    split: str = "test"
+    """Split to predict."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RunRequest:
     """A trained method and the data it is shown."""
 
@@ -94,7 +128,7 @@ class PredictRequest(RunRequest):
     split: str = "test"
     """Split to predict."""
     mode: Mode = "fast"
-    """fast: networks only; refine: with optimisation at test time."""
+    """fast: networks only; refine: with optimisation at test time; quick: with a little of it."""
     oracle: bool = False
     """Show a method that can use them true labels of the test split (icp: the parts); the
     variant then begins with oracle."""
@@ -115,8 +149,8 @@ class StabilityRequest(RunRequest):
     """Report, FILE.json."""
     split: str = "test"
     """Split whose clouds are used, without labels."""
-    mode: Literal["fast", "refine", "both"] = "both"
-    """Inference modes to measure."""
+    mode: Literal["fast", "quick", "refine", "both"] = "both"
+    """Inference modes to measure; both: fast and refine."""
     samples: int = 20
     """Clouds, evenly spread over the split."""
     motions: int = 2
@@ -163,8 +197,8 @@ class StudyRequest:
     """Folder for predictions/, scores/, ladders/, pictures/, stability/ and README.md."""
     split: str = "test"
     """Split to score."""
-    mode: Literal["fast", "refine", "both"] = "both"
-    """Inference modes to study."""
+    mode: Literal["fast", "quick", "refine", "both"] = "both"
+    """Inference modes to study; both: fast and refine."""
     calibration: int = 500
     """Training clouds that fix the frames of a method that saw no poses."""
     samples: int = 20

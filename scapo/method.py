@@ -19,7 +19,7 @@ from scapo.categories import Category
 from scapo.pictures import PictureData
 from scapo.types import Labels, Observation, Prediction, Supervision
 
-Mode = Literal["fast", "refine"]
+Mode = Literal["fast", "quick", "refine"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -217,8 +217,9 @@ class AbstractMethod(nn.Module, ABC):
 
         Args:
             observation: A batch, camera frame, metres.
-            mode: `fast`, networks only; `refine`, with search or optimisation at test time. A
-                method that knows one way alone takes it in both modes.
+            mode: `fast`, networks only; `refine`, with search or optimisation at test time;
+                `quick`, with a little of it. A method that knows no such way takes the one it
+                knows in all modes.
         """
 
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:

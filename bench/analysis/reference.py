@@ -24,6 +24,10 @@ from bench.scoring.truth import Truth, blocks, revolute
 from scapo.geometry import rigid as geometry
 from scapo.store import Arrays, Split, open_split
 
+RECIPE = "scapo-reference/1"
+"""To be changed with what the references answer: scores of another recipe are made again."""
+TRAINED_ON = ("clean", "sensor")
+"""Parts of a benchmark whose training split serves where a part has none, such as `real`."""
 TEMPLATE_CLOUDS = 50
 """Training clouds whose labelled points, in the object frame, vote for labels."""
 
@@ -51,15 +55,35 @@ def write_reference(
     Raises:
         StoreError: No such data.
     """
-    train, test = open_split(data, category, "train"), open_split(data, category, split)
+    test = open_split(data, category, split)
+    train = training_split(test) or open_split(data, category, "train")
+    write_answers(kind, train, test, out)
+
+
+def training_split(split: Split) -> Split | None:
+    """The split `train` of the same part and category, else of a part in `TRAINED_ON`."""
+    category, name = split.folder.resolve().parent, split.manifest.category
+    parts = [category.parent.parent / part / name for part in TRAINED_ON]
+    for folder in (category, *parts):
+        if (folder / "train" / "manifest.json").is_file():
+            found = Split(folder / "train")
+            if found.manifest.category == name and found.manifest.parts == split.manifest.parts:
+                return found
+    return None
+
+
+def write_answers(kind: Kind, train: Split, test: Split, out: Path) -> None:
+    """Write the predictions file of a reference for the split `test`, learned on `train`."""
     turns = revolute(test.manifest)
     means = learn(kind, train)
     parts = [_answer(kind, truth, means, turns) for truth in blocks(test)]
     arrays: Arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     header = Header(
-        method=kind, variant="", category=category, split=split, seed=0,
-        data_digest=test.manifest.digest, supervision=("joint", "pose", "segmentation"),
+        method=kind, variant="", category=test.manifest.category, split=test.manifest.split,
+        seed=0, data_digest=test.manifest.digest, supervision=("joint", "pose", "segmentation"),
+        camera=False,
         budget={"training clouds": train.manifest.count, "training": "means of the labels"},
+        run={"data_digest": train.manifest.digest, "recipe": RECIPE},
     )  # fmt: skip
     write_predictions(out, header, arrays)
 

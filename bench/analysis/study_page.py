@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -109,23 +109,17 @@ def _scores_row(entry: Entry) -> list[str]:
             for value in (row.mean, row.low, row.high, np.nanmedian(values))
         )
         cells.append(f"{mean} [{low}, {high}] {median}")
-    seconds = _positive(scores.report.budget, "seconds_per_cloud")
+    seconds = scores.report.cost("seconds_per_cloud")
     return [_run(entry), entry.mode, *cells, f"{1 / seconds:.1f}" if seconds else "–"]
-
-
-def _positive(budget: Mapping[str, Any], name: str) -> float | None:
-    """A number of the budget, which is as the predictions' writer has it: anything."""
-    value = budget.get(name)
-    return value if isinstance(value, (int, float)) and 0 < value < 1e15 else None
 
 
 def _origin(entry: Entry) -> list[str]:
     report = read_report(entry.scores)
     run, budget = report.run, report.budget
-    trained = _positive(budget, "training_seconds")
+    trained = report.cost("training_seconds")
     found = run.get("machine")
     device: dict[str, Any] = found if isinstance(found, dict) else {}
-    size = int(_positive(budget, "parameters") or 0)
+    size = int(report.cost("parameters") or 0)
     return [
         _run(entry), entry.mode, str(report.seed),
         "–" if trained is None else f"{trained / 60:.1f} min, {size:,} parameters",

@@ -12,16 +12,18 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from bench.methods import load
+from bench.methods import find, load
 from bench.requests import PredictRequest
 from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
 from bench.scoring.predictions import Header, write_predictions
 from scapo.method import AbstractMethod, OracleMethod, evenly
 from scapo.records import map_tensors
-from scapo.store import open_split
+from scapo.store import Split, open_split
 from scapo.store.checkpoint import require_fields
 from scapo.store.files import Arrays
+from scapo.store.files import Header as StoredHeader
+from scapo.store.provenance import machine
 from scapo.store.samples import SampleDataset, label, observe, observed
 from scapo.types import Prediction
 
@@ -41,7 +43,8 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         watch: Passes the batches on, and may show how far it is.
 
     Returns:
-        How many clouds were answered, and the seconds of each.
+        How many clouds were answered, and the seconds of each: the method's alone, without
+        what it takes to load it and to read the clouds.
 
     Raises:
         ValueError: `oracle` for a method that cannot use labels.
@@ -55,33 +58,52 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     split = open_split(request.data, header["category"], request.split)
     samples = SampleDataset(split, observed(split))
     chosen = evenly(len(samples), request.limit or len(samples))
-    started = time.perf_counter()
-    batches = watch(chosen.split(request.batch))
-    parts = [_answer(request, method, samples, index, device) for index in batches]
-    seconds = (time.perf_counter() - started) / len(chosen)
+    parts: list[Arrays] = []
+    seconds = 0.0
+    for index in watch(chosen.split(request.batch)):
+        batch = samples.batch(index)
+        started = time.perf_counter()
+        parts.append(_answer(request, method, batch, device))  # waits for the device
+        seconds += time.perf_counter() - started
     words = [method.variant, "" if request.mode == "fast" else request.mode, *oracle]
-    write_predictions(
-        request.out,
-        Header(
-            method=method.name,
-            variant="-".join(word for word in words if word),
-            category=header["category"],
-            split=request.split,
-            seed=header["seed"],
-            data_digest=split.manifest.digest,
-            supervision=tuple(sorted(method.supervision)),
-            budget={
-                "device": device,
-                "parameters": sum(item.numel() for item in method.parameters()),
-                "steps": header["steps"],
-                **timing(request.checkpoint),
-                "seconds_per_cloud": round(seconds, 5),
-            },
-            run={name: header[name] for name in RUN_FIELDS if name in header},
-        ),
-        joined(parts, chosen.numpy(), len(samples)),
+    budget = {
+        "device": device,
+        "processor": _processor(device),
+        "batch": request.batch,
+        "parameters": sum(item.numel() for item in method.parameters()),
+        "steps": header["steps"],
+        **timing(request.checkpoint),
+        "seconds_per_cloud": round(seconds / len(chosen), 6),
+    }
+    made = _made(method, header, "-".join(word for word in words if word), split, budget)
+    write_predictions(request.out, made, joined(parts, chosen.numpy(), len(samples)))
+    return len(chosen), seconds / len(chosen)
+
+
+def _made(
+    method: AbstractMethod, header: StoredHeader, variant: str, split: Split, budget: dict[str, Any]
+) -> Header:
+    """The header of the predictions of a checkpoint with this header."""
+    entry = find(header["method"])
+    return Header(
+        method=method.name,
+        variant=variant,
+        category=header["category"],
+        split=split.manifest.split,
+        seed=header["seed"],
+        data_digest=split.manifest.digest,
+        supervision=tuple(sorted(method.supervision)),
+        camera=None if entry is None else entry.camera,
+        budget=budget,
+        run={name: header[name] for name in RUN_FIELDS if name in header},
     )
-    return len(chosen), seconds
+
+
+def _processor(device: str) -> str:
+    """The name of what computes, with the number of cores and threads of a CPU."""
+    found = machine(device)
+    cores = f"{found['cpu']}, {found['cores']} cores, {found['threads']} threads"
+    return str(found.get("gpu", cores))
 
 
 def _oracle_words(method: AbstractMethod) -> list[str]:
@@ -98,12 +120,11 @@ def _oracle_words(method: AbstractMethod) -> list[str]:
 def _answer(
     request: PredictRequest,
     method: AbstractMethod,
-    samples: SampleDataset,
-    index: torch.Tensor,
+    samples: dict[str, torch.Tensor],
     device: str,
 ) -> Arrays:
-    """The tensors of a predictions file for the samples of `index`."""
-    batch = map_tensors(samples.batch(index), lambda tensor: tensor.to(device))
+    """The tensors of a predictions file for some samples."""
+    batch = map_tensors(samples, lambda tensor: tensor.to(device))
     observation = observe(batch)
     if request.oracle and isinstance(method, OracleMethod):
         return to_arrays(method.predict_given(observation, label(batch).keep(method.oracle)))

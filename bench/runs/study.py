@@ -12,11 +12,13 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+from bench.analysis.beside import evaluate_beside
 from bench.analysis.study_page import Entry, write_page
 from bench.figures.explain import explain
 from bench.figures.run import draw_pictures
 from bench.methods import load
 from bench.requests import (
+    EvaluateRequest,
     Mode,
     PicturesRequest,
     PredictRequest,
@@ -26,7 +28,6 @@ from bench.requests import (
 )
 from bench.runs.predict import Watch, predict
 from bench.runs.stability import measure_stability
-from bench.scoring.evaluate import evaluate
 from scapo.store import StoreError
 from scapo.store.checkpoint import WEIGHTS
 
@@ -111,7 +112,9 @@ class _Study:
 
         drawn = PicturesRequest(checkpoint=run, data=data, predictions=scored, out=pictures,
                                 split=split, calibration=frames)  # fmt: skip
-        self._made(scores, inputs, lambda: evaluate(asked(scores)))
+        self._made(scores, inputs, lambda: evaluate_beside(EvaluateRequest(
+            predictions=scored, data=data, out=scores, split=split, calibration=frames,
+        )))  # fmt: skip
         self._made(ladder / "ladder.md", inputs, lambda: explain(asked(ladder)))
         self._made(pictures / "ranking.png", inputs, lambda: list(draw_pictures(drawn)))
         return Entry(name=name, mode=mode, scores=scores, ladder=ladder / "ladder.md",

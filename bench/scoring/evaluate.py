@@ -19,12 +19,17 @@ from bench.scoring.compat_files import Canon, check_record, fit_canon, score_com
 from bench.scoring.predictions import Header, Predictions, read_prediction_header
 from bench.scoring.score_files import Run, side_file, writing
 from bench.scoring.scores import Errors, Frames, Rows, score
-from bench.scoring.summary import summarise
+from bench.scoring.summary import by_trait, summarise
 from bench.scoring.truth import Truth, blocks, revolute, symmetry
 from bench.statistics import BOOTSTRAP_SEED
 from scapo.store import Split, StoreError, open_split, sha256_file
 from scapo.store.provenance import commit, machine
 from scapo.text import one_line
+
+PARTS = ("clean", "complete", "isolated", "sensor", "real")
+"""Folders above the categories that say what the data are."""
+PROTOCOLS = {"full": "complete", "isolated": "isolated"}
+"""How the clouds were taken -> the part that such data belong to."""
 
 
 def evaluate(request: Request) -> dict[str, Any]:
@@ -99,8 +104,8 @@ def data_name(folder: Path, split: Split) -> str:
     """`NAME@DIGEST`: what the data are called, and the first 12 digits of their digest.
 
     NAME is the manifest's option `benchmark`, else the folder above the category where that is
-    part of the data set or of the benchmark (`clean`, `sensor`, `complete`, `real`), else `sensor`
-    for data with simulated sensor noise and `clean` without.
+    part of the data set or of the benchmark (`PARTS`), else `complete` for whole surfaces,
+    `isolated` for parts rendered alone, `sensor` for data with sensor noise, `clean` without.
     """
     manifest, root = split.manifest, folder.resolve()
     named = manifest.options.get("benchmark")
@@ -108,8 +113,10 @@ def data_name(folder: Path, split: Split) -> str:
     inside = above != root and above.is_relative_to(root)
     if isinstance(named, str) and named:
         name = one_line(named, 100)
-    elif inside or above.name in ("clean", "sensor", "complete", "real"):
+    elif inside or above.name in PARTS:
         name = above.name
+    elif (protocol := str(manifest.options.get("protocol"))) in PROTOCOLS:
+        name = PROTOCOLS[protocol]
     else:
         noisy = manifest.options.get("noise", "none") != "none"
         name = "sensor" if noisy else "clean"
@@ -151,8 +158,21 @@ def _report(
             "predictions": sha256_file(request.predictions),
         },
         **_origin(header),
+        "camera": header.camera,
         "instance": instance.tolist(),
+        **_by_trait(request, split, errors, instance),
         **summarise(errors, instance, request.settings.ap_rule),
+    }
+
+
+def _by_trait(
+    request: Request, split: Split, errors: Errors, instance: Int[np.ndarray, " B"]
+) -> dict[str, Any]:
+    """What sets each object apart from the training shapes, and the summaries told apart by it."""
+    trait = [thing.trait for thing in split.manifest.instances]
+    return {
+        "trait": trait if any(trait) else [],
+        "by_trait": by_trait(errors, instance, trait, request.settings.ap_rule),
     }
 
 

@@ -45,9 +45,10 @@ class Header:
     """`digest` of the manifest of the split that was predicted."""
     supervision: tuple[Supervision, ...]
     """Labels that training used."""
+    camera: bool | None = None
+    """Whether training or prediction uses where the camera stands; None: not said."""
     budget: dict[str, Any] = field(default_factory=dict)
-    """Anything about cost: device, seconds of training, parameters, seconds per cloud."""
-
+    """Anything about cost: device, batch, seconds_per_cloud, training_seconds, parameters."""
     run: dict[str, Any] = field(default_factory=dict)
     """The training behind it: commit, config, machine, data digest of its split."""
 
@@ -64,6 +65,7 @@ class Header:
             "supervision": sorted(self.supervision),
             "budget": self.budget,
             "run": self.run,
+            **({} if self.camera is None else {"camera": self.camera}),
         }
 
 
@@ -102,9 +104,19 @@ def read_prediction_header(path: Path) -> Header:
         seed=seed,
         data_digest=_text(path, {DIGEST_KEYS[0]: digests[0]}, DIGEST_KEYS[0]),
         supervision=_supervision(path, record),
+        camera=_camera(path, record),
         budget=_object(path, record, "budget"),
         run=_object(path, record, "run"),
     )
+
+
+def _camera(path: Path, record: dict[str, Any]) -> bool | None:
+    value = record.get("camera")
+    if value is not None and not isinstance(value, bool):
+        raise StoreError(
+            f"{path}: header field 'camera': expected true or false, found {_shown(value)}"
+        )
+    return value
 
 
 def _object(path: Path, record: dict[str, Any], name: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, cast
 
@@ -147,6 +147,19 @@ class Report:
     """By metric and unit, such as `iou_1`."""
     average_precision: dict[str, Any]
     bootstrap: Bootstrap
+    camera: bool | None = None
+    """Whether training or prediction uses where the camera stands; None: not said."""
+    trait: tuple[str, ...] = ()
+    """Of each object, what sets it apart from the training shapes; empty where none has any."""
+    by_trait: dict[str, Any] = field(default_factory=dict)
+    """Trait -> its samples, instances, `summary` and `average_precision`."""
+
+    def cost(self, name: str) -> float | None:
+        """A number of the budget, which is as the predictions' writer has it: anything."""
+        value = self.budget.get(name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return None
+        return float(value) if 0 < value < 1e15 else None
 
 
 def side_file(scores: Path) -> Path:
@@ -250,6 +263,22 @@ class Scores:
     def instance(self) -> Int[np.ndarray, " B"]:
         """The object of each sample."""
         return np.asarray(self.report.instance, np.int64)[self.samples]
+
+    @property
+    def traits(self) -> tuple[str, ...]:
+        """Every trait that some sample has, sorted."""
+        return tuple(sorted(set(self._trait_of_samples()) - {""}))
+
+    def of_trait(self, trait: str) -> Scores:
+        """The samples of objects with this trait alone."""
+        members = np.array([own == trait for own in self._trait_of_samples()], bool)
+        errors = {key: table[members] for key, table in self.errors.items()}
+        return replace(self, samples=self.samples[members], errors=errors)
+
+    def _trait_of_samples(self) -> list[str]:
+        """The trait of each sample's object, empty where the report does not say."""
+        known = self.report.trait
+        return [known[i] if 0 <= i < len(known) else "" for i in self.instance.tolist()]
 
 
 def is_report(path: Path) -> bool:

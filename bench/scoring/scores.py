@@ -86,8 +86,10 @@ def score(
         rows.get("joint_axis"),
         settings.pivot,
     )
+    answered = agreement.answered[:, None]
     out: Errors = {
         ("iou", "1"): agreement.iou,
+        ("order", "1"): np.where(answered, agreement.order.astype(np.float64), np.nan),
         ("joint_direction", "deg"): direction,
         **_lengths("joint_pivot", distance, truth),
         **_states(truth, rows, frames, agreement, true_axis),

@@ -58,9 +58,25 @@ class Row:
     marks: Marks | None
     """None: not known, or the row is no method."""
     cells: tuple[Cell, ...]
+    camera: bool | None = None
+    """Whether it uses where the camera stands; None: not said."""
     ranked: bool = True
     """Takes part in the choice of the best."""
     seeds: int = 0
+    plain: str = ""
+    """The method of the row that this one is another reading of."""
+
+    @property
+    def empty(self) -> bool:
+        """No cell has a number."""
+        return all(cell.value is None for cell in self.cells)
+
+    def repeats(self, other: Row) -> bool:
+        """Whether another row of the same source prints all that this one does."""
+        pairs = zip(self.cells, other.cells, strict=True)
+        return self.source == other.source and all(
+            mine.value is None or mine.shown == its.shown for mine, its in pairs
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,14 +85,16 @@ class Block:
 
     heading: str
     rows: tuple[Row, ...]
-    higher: tuple[bool, ...]
+    higher: tuple[bool | None, ...]
+    """None: neither is better."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """A whole table."""
 
-    number: int
+    number: str
+    """Also of its files: `1b` is in `table1b.md`."""
     title: str
     first: str
     """Heading of the block column."""
@@ -101,7 +119,8 @@ def mark_best(block: Block) -> Block:
             if row.source == source and row.ranked and row.marks is not None and not all(row.marks)
         ]
         for column, higher in enumerate(block.higher):
-            _mark(rows, members, column, higher=higher)
+            if higher is not None:
+                _mark(rows, members, column, higher=higher)
     return replace(block, rows=tuple(rows))
 
 

@@ -4,28 +4,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from bench.metrics import ApRule
+from bench.tables.means import measured_in
 from bench.tables.model import Block, Cell, Row, Table, mark_best
 from bench.tables.paper import MEAN, Cells, Mismatch
 from bench.tables.results import (
     Place,
     Results,
     Sampled,
-    Series,
     averaged,
     check_monotone,
     measured,
     precise,
+    seconds_per_cloud,
 )
 from bench.tables.rows import (
+    Line,
     budget_notes,
-    display_name,
     general_notes,
-    in_order,
-    listed_series,
-    marks_of,
+    kept,
+    left_out,
+    line_row,
+    lines_of,
 )
 from bench.tables.spec import (
     PAPER_METHODS,
@@ -33,69 +34,79 @@ from bench.tables.spec import (
     PRECISION_HEADINGS,
     PRECISION_KEYS,
     REFERENCE,
+    SWAPPED,
     TABLE_1,
     TABLE_2_CATEGORIES,
-    Measure,
 )
 
-STATE = "State"
+MORE = ("State", "Other order", "s/cloud")
+"""Columns of ours beside the paper's."""
 
 
 def table_2(results: Results, cells: Cells, wrong: Sequence[Mismatch], rule: ApRule) -> Table:
     """Average precision on `sensor`, a block per category, and the mean over categories."""
-    state = next(measure for measure in TABLE_1 if measure.metric == "joint_state")
-    ours: dict[Series, list[list[Sampled | None]]] = {}
-    for series in listed_series(results, "sensor", with_order=True):
-        ours[series] = [
-            _precision_row(results, series, name, rule, state, number)
-            for number, name in enumerate(TABLE_2_CATEGORIES)
-        ]
-    blocks = []
+    ours: list[tuple[Line, list[list[Sampled | Cell | None]]]] = [
+        (line, [_precision_row(results, line, name, rule, number)
+                for number, name in enumerate(TABLE_2_CATEGORIES)])
+        for line in lines_of(results, "sensor")
+    ]  # fmt: skip
+    candidates: list[tuple[str, list[Row]]] = []
     for number, name in enumerate((*TABLE_2_CATEGORIES, MEAN)):
         rows = _printed_precision(cells, wrong, name)
-        for series, found in ours.items():
-            parts = list(zip(*found, strict=True))
-            row = [averaged(column) for column in parts] if name == MEAN else [
-                Cell() if part is None else part.cell for part in found[number]
+        for line, found in ours:
+            row = [_mean(column) for column in zip(*found, strict=True)] if name == MEAN else [
+                _cell(part) for part in found[number]
             ]  # fmt: skip
-            rows.append(_row_2(results, series, row))
-        blocks.append(
-            Block(
-                heading=name.capitalize(),
-                rows=tuple(in_order(rows)),
-                higher=(True,) * len(PRECISION_KEYS) + (False,),
-            )
-        )
+            rows.append(line_row(results, line, row))
+        candidates.append((name.capitalize(), rows))
+    higher = (True,) * len(PRECISION_KEYS) + (False, None, None)
+    blocks = [Block(heading=name, rows=kept(rows), higher=higher) for name, rows in candidates]
     return Table(
-        number=2,
-        title=f"Sensor data: average precision in percent, rule {rule}, and the joint state error "
-        "(deg, for the drawer cm)",
+        number="2",
+        title=f"Sensor data: average precision in percent, rule {rule}, the joint state error "
+        "(deg, for the drawer cm), and the share of samples whose parts were taken in another "
+        "order, in percent",
         first="Category",
-        groups=(*PRECISION_GROUPS, ("", 1)),
-        columns=(*PRECISION_HEADINGS, STATE),
+        groups=(*PRECISION_GROUPS, ("", len(MORE))),
+        columns=(*PRECISION_HEADINGS, *MORE),
         blocks=tuple(mark_best(block) for block in blocks),
-        notes=(*general_notes(), *budget_notes(results, "sensor", TABLE_2_CATEGORIES)),
-    )
-
-
-def _row_2(results: Results, series: Series, cells: Sequence[Cell]) -> Row:
-    return Row(
-        method=display_name(series),
-        source="ours",
-        marks=marks_of(results, series),
-        cells=tuple(cells),
-        ranked=series.method not in REFERENCE and not series.switches,
+        notes=(
+            *general_notes(),
+            *left_out(results, candidates, "sensor"),
+            *budget_notes(results, "sensor", TABLE_2_CATEGORIES),
+        ),
     )
 
 
 def _precision_row(
-    results: Results, series: Series, category: str, rule: ApRule, state: Measure, seed: int
-) -> list[Sampled | None]:
-    runs = results.runs(series, Place("sensor", category))
+    results: Results, line: Line, category: str, rule: ApRule, seed: int
+) -> list[Sampled | Cell | None]:
+    runs = line.runs(results, Place("sensor", category))
     values = {key: precise(runs, key, rule, seed) for key in PRECISION_KEYS}
     check_monotone(values)
-    slide = replace(state, unit="m", factor=100)
-    return [*values.values(), measured(runs, state, seed) or measured(runs, slide, seed)]
+    state = next(measure for measure in TABLE_1 if measure.metric == "joint_state")
+    further, reference = line.series.switches != "", line.series.method in REFERENCE
+    return [
+        *values.values(),
+        measured_in(runs, state, seed),
+        None if further else measured(runs, SWAPPED, seed),
+        None if further or reference else seconds_per_cloud(runs),
+    ]
+
+
+def _cell(part: Sampled | Cell | None) -> Cell:
+    return Cell() if part is None else part if isinstance(part, Cell) else part.cell
+
+
+def _mean(column: Sequence[Sampled | Cell | None]) -> Cell:
+    """Over categories; of seconds, which have no interval, the plain mean."""
+    cells = [part for part in column if isinstance(part, Cell)]
+    if not cells:
+        return averaged([part for part in column if not isinstance(part, Cell)])
+    known = [cell.value for cell in cells if cell.value is not None]
+    if len(known) < len(column):
+        return Cell()
+    return Cell(value=sum(known) / len(known), decimals=cells[0].decimals)
 
 
 def _printed_precision(cells: Cells, wrong: Sequence[Mismatch], category: str) -> list[Row]:
@@ -114,7 +125,7 @@ def _printed_precision(cells: Cells, wrong: Sequence[Mismatch], category: str) -
                 method=PAPER_METHODS.get(method, method),
                 source="paper",
                 marks=found[0].marks,
-                cells=(*row, Cell()),
+                cells=(*row, *(Cell() for _ in MORE)),
             )
         )
     return rows

@@ -11,24 +11,24 @@ import csv
 import io
 import re
 
-from bench.tables.model import DASH, Cell, Marks, Row, Table
+from bench.tables.model import DASH, Cell, Row, Table
 from scapo.text import as_cell, as_markdown
 
 
 def to_markdown(table: Table) -> str:
     """A GitHub table with its notes."""
-    heads = (table.first, "Method", "Source", "Pose", "Seg.", "Joint", *table.columns)
+    heads = (table.first, "Method", "Source", *MARKS, *table.columns)
     lines = [
         f"**Table {table.number}.** {table.title}.",
         "",
         _line([as_markdown(head) for head in heads]),
-        _line(["---"] * 6 + ["---:"] * len(table.columns)),
+        _line(["---"] * (3 + len(MARKS)) + ["---:"] * len(table.columns)),
     ]
     for block in table.blocks:
         first = f"**{as_markdown(block.heading)}**"
         for row in block.rows:
             names = [first, as_markdown(row.method), row.source]
-            lines.append(_line([*names, *_checks(row.marks, "✓"), *map(_markdown, row.cells)]))
+            lines.append(_line([*names, *_checks(row, "✓", DASH), *map(_markdown, row.cells)]))
             first = ""
     return "\n".join([*lines, "", *(f"- {as_markdown(note)}" for note in table.notes), ""])
 
@@ -37,8 +37,13 @@ def _line(fields: list[str]) -> str:
     return "| " + " | ".join(fields) + " |"
 
 
-def _checks(marks: Marks | None, check: str) -> list[str]:
-    return [check if mark else "" for mark in marks or (False, False, False)]
+MARKS = ("Pose", "Seg.", "Joint", "Camera")
+"""Headings of what a row used."""
+
+
+def _checks(row: Row, check: str, unknown: str) -> list[str]:
+    used = (*(row.marks or (False, False, False)), row.camera)
+    return [unknown if mark is None else check if mark else "" for mark in used]
 
 
 def _markdown(cell: Cell) -> str:
@@ -53,8 +58,9 @@ def _markdown(cell: Cell) -> str:
 
 
 COLUMNS = (
-    "table", "block", "method", "source", "pose", "segmentation", "joint", "column", "value",
-    "low", "high", "deviation", "seeds", "n", "k", "undefined", "best", "printed_mean_mismatch",
+    "table", "block", "method", "source", "pose", "segmentation", "joint", "camera", "column",
+    "value", "low", "high", "deviation", "seeds", "n", "k", "undefined", "best",
+    "printed_mean_mismatch",
 )  # fmt: skip
 
 
@@ -67,6 +73,7 @@ def to_csv(table: Table) -> str:
     for block in table.blocks:
         for row in block.rows:
             marks = ("", "", "") if row.marks is None else tuple(map(int, row.marks))
+            marks = (*marks, "" if row.camera is None else int(row.camera))
             names = (as_cell(block.heading), as_cell(row.method), row.source)
             for column, cell in zip(columns, row.cells, strict=True):
                 writer.writerow((table.number, *names, *marks, column, *_values(cell, row.seeds)))
@@ -76,7 +83,7 @@ def to_csv(table: Table) -> str:
 def _column_names(table: Table) -> list[str]:
     over = [name for name, width in table.groups for _ in range(width)] or [""] * len(table.columns)
     return [
-        f"{group} {name}".strip() if table.number == 2 else name
+        f"{group} {name}".strip() if table.number == "2" else name
         for group, name in zip(over, table.columns, strict=True)
     ]
 
@@ -128,14 +135,14 @@ def to_latex(table: Table) -> str:
     """A document of one page as large as the table, with the notes below."""
     rows = [row for block in table.blocks for row in block.rows]
     wide = any(cell.low is not None for row in rows for cell in row.cells)
-    width = 80 + len(table.columns) * (26 if wide else 13)
+    width = 90 + len(table.columns) * (26 if wide else 13)
     height = 45 + 3 * (len(rows) + len(table.blocks)) + 3 * len(table.blocks)
     height += sum(3 + 3 * len(note) // width for note in table.notes)
-    names = ("Method", "", "Pose", "Seg.", "Joint", *table.columns)
+    names = ("Method", "", *MARKS, *table.columns)
     lines = [
         PREAMBLE.format(width=width, height=height),
         rf"\textbf{{Table {table.number}.}} {escape(table.title)}.\par\medskip",
-        rf"\begin{{tabular}}{{@{{}}ll{'c' * 3}{'r' * len(table.columns)}@{{}}}}",
+        rf"\begin{{tabular}}{{@{{}}ll{'c' * len(MARKS)}{'r' * len(table.columns)}@{{}}}}",
         r"\toprule",
         *_over(table),
         " & ".join(map(escape, names)) + r" \\",
@@ -152,8 +159,8 @@ def to_latex(table: Table) -> str:
 def _over(table: Table) -> list[str]:
     if not table.groups:
         return []
-    cells = [r"& & \multicolumn{3}{c}{Supervision}"]
-    rules, column = [r"\cmidrule(lr){3-5}"], 6
+    cells = [r"& & \multicolumn{3}{c}{Supervision} &"]  # nothing over the camera
+    rules, column = [r"\cmidrule(lr){3-5}"], 3 + len(MARKS)
     for name, width in table.groups:
         cells.append(rf"\multicolumn{{{width}}}{{c}}{{{escape(name)}}}")
         if name:
@@ -163,7 +170,7 @@ def _over(table: Table) -> list[str]:
 
 
 def _latex_row(row: Row) -> str:
-    checks = _checks(row.marks, r"$\checkmark$")
+    checks = _checks(row, r"$\checkmark$", "--")
     return " & ".join([escape(row.method), row.source, *checks, *map(_latex, row.cells)]) + r" \\"
 
 

@@ -5,23 +5,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from bench.metrics import ApRule
 from bench.scoring.score_files import SUFFIX, Scores, is_report, read_scores, side_file
-from bench.scoring.summary import passes
+from bench.scoring.summary import passes, swapped
 from bench.statistics import bounds, resampled_means, spread
 from bench.tables.model import Cell
-from bench.tables.spec import PRECISION_KEYS, Measure
+from bench.tables.spec import PRECISION_KEYS, REFERENCE, Measure
 from scapo.store import StoreError
 
-Kind = Literal["clean", "sensor"]
-TABLE_SPLIT = "test"
+Kind = Literal["clean", "complete", "isolated", "sensor", "real"]
+"""What data are: single views, whole surfaces, parts seen alone, a sensor's, real models."""
+TABLE_SPLIT, UNSEEN_SPLIT = "test", "test-ood"
 _SWITCHES = re.compile(r"^(?P<variant>.*?)(?:\[(?P<switches>[^\[\]]*)\])?$")
 
 
@@ -41,52 +42,95 @@ class Place:
 
     kind: Kind
     category: str
+    unseen: bool = False
+    """The split of objects unlike those of training."""
 
 
 class Results:
-    """Scores on the test split by series and place."""
+    """Scores by series and place."""
 
-    def __init__(self, scores: Sequence[Scores]) -> None:
-        """Group the runs.
+    def __init__(self, scores: Sequence[Scores], split: str = TABLE_SPLIT) -> None:
+        """Group the runs on `split`, and those on objects unlike the training's.
 
         Raises:
-            StoreError: One place has scores on two data sets, or a run was scored twice.
+            StoreError: One place has scores on two data sets, a run was scored twice, or two
+                readings of a run are of different predictions.
         """
         self._runs: dict[tuple[Series, Place], dict[int, Scores]] = {}
         digests: dict[Place, tuple[str, Path]] = {}
         for item in scores:
-            if item.run.split != TABLE_SPLIT:
+            if item.run.split not in (split, UNSEEN_SPLIT):
                 continue
-            place = Place(kind_of(item.run.data), item.run.category)
+            unseen = item.run.split != split
+            place = Place(kind_of(item.run.data), item.run.category, unseen)
             data, path = digests.setdefault(place, (item.run.data, item.path))
             if data != item.run.data:
                 raise StoreError(
                     f"{item.path}: expected scores on {data} like {path}, found {item.run.data}"
                 )
             runs = self._runs.setdefault((series_of(item), place), {})
+            if item.run.method in REFERENCE and _same(item, runs.get(item.run.seed)):
+                continue  # made beside the scores of several methods
             if item.run.seed in runs:
                 raise StoreError(
                     f"{item.path}: expected one scores file per run, found seed "
                     f"{item.run.seed} also in {runs[item.run.seed].path}"
                 )
             runs[item.run.seed] = item
+        self._check_readings()
 
-    def series(self, kind: Kind) -> list[Series]:
+    def _check_readings(self) -> None:
+        """Refuse further readings of other predictions than the row they stand beside."""
+        for (series, place), runs in self._runs.items():
+            plain = self._runs.get((replace(series, switches=""), place), {})
+            for seed, item in runs.items():
+                if seed not in plain:
+                    continue
+                mine, its = (one.report.digests.predictions for one in (item, plain[seed]))
+                if mine != its:
+                    raise StoreError(
+                        f"{item.path}: expected scores of the predictions of {plain[seed].path}, "
+                        "found those of others"
+                    )
+
+    def series(self, kind: Kind, *, unseen: bool = False) -> list[Series]:
         """Every series with scores on data of this kind, sorted."""
-        return sorted({series for series, place in self._runs if place.kind == kind})
+        wanted = (kind, unseen)
+        return sorted({s for s, place in self._runs if (place.kind, place.unseen) == wanted})
 
     def runs(self, series: Series, place: Place) -> list[Scores]:
         """Its runs there, by seed."""
         found = self._runs.get((series, place), {})
         return [found[seed] for seed in sorted(found)]
 
-    def all_runs(self) -> list[Scores]:
-        """Every run, sorted."""
-        keys = sorted(self._runs, key=lambda key: (key[0], key[1].kind, key[1].category))
+    def categories(self, kind: Kind, *, unseen: bool = False) -> list[str]:
+        """Every category with scores on data of this kind, sorted."""
+        wanted = (kind, unseen)
+        return sorted({p.category for _, p in self._runs if (p.kind, p.unseen) == wanted})
+
+    def all_runs(self, *, unseen: bool = True) -> list[Scores]:
+        """Every run, sorted; those on objects unlike the training's only if wanted."""
+        keys = sorted(
+            (key for key in self._runs if unseen or not key[1].unseen),
+            key=lambda key: (key[0], key[1].kind, key[1].category, key[1].unseen),
+        )
         return [run for key in keys for run in self.runs(*key)]
 
 
-def load(folder: Path) -> Results:
+def _same(item: Scores, other: Scores | None) -> bool:
+    """Whether two scores of one run say the same, but for the last digits of another machine."""
+    return (
+        other is not None
+        and item.errors.keys() == other.errors.keys()
+        and all(
+            table.shape == other.errors[key].shape
+            and np.allclose(table, other.errors[key], rtol=1e-5, atol=1e-5, equal_nan=True)
+            for key, table in item.errors.items()
+        )
+    )
+
+
+def load(folder: Path, split: str = TABLE_SPLIT) -> Results:
     """Every `*.csv.gz` below a folder.
 
     Raises:
@@ -100,13 +144,16 @@ def load(folder: Path) -> Results:
     )
     for path in sorted(alone):
         raise StoreError(f"{path}: expected the scores of this report beside it, found none")
-    return Results([scores for file in files for scores in read_scores(file)])
+    return Results([scores for file in files for scores in read_scores(file)], split)
 
 
 def kind_of(data: str) -> Kind:
     """Which tables the data belong to, from the name before the `@`."""
     name = data.partition("@")[0].rpartition("/")[2]
-    return "sensor" if name.endswith("sensor") or name.startswith("op-align-real") else "clean"
+    if name.endswith("sensor") or name.startswith("op-align-real"):
+        return "sensor"
+    last = name.rpartition("-")[2]
+    return cast("Kind", last) if last in ("complete", "isolated", "real") else "clean"
 
 
 def series_of(scores: Scores) -> Series:
@@ -128,10 +175,20 @@ class Sampled:
 def measured(runs: Sequence[Scores], measure: Measure, seed: int) -> Sampled | None:
     """Mean over samples, slots and seeds; None where nothing was run or is defined."""
     key = (measure.metric, measure.unit)
-    tables = [run.errors[key] * measure.factor for run in runs if key in run.errors]
+    tables = [run.errors[key] for run in runs if key in run.errors]
+    tables = [measure.factor * (swapped(t) if key[0] == "order" else t) for t in tables]
     if not tables or all(np.isnan(table).all() for table in tables):
         return None
     return _sampled(runs, tables, measure.decimals, seed)
+
+
+def seconds_per_cloud(runs: Sequence[Scores]) -> Cell:
+    """As the predictions say it, a mean over seeds; empty where one does not say it."""
+    found = [run.report.cost("seconds_per_cloud") for run in runs]
+    known = [value for value in found if value is not None]
+    if not known or len(known) < len(found):
+        return Cell()
+    return Cell(value=float(np.mean(known)), decimals=4)
 
 
 def precise(runs: Sequence[Scores], key: str, rule: ApRule, seed: int) -> Sampled | None:

@@ -7,16 +7,30 @@ Below them the notes of every table: how to read it, and what each row cost.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from bench.methods import all_methods
-from bench.tables.model import Cell, Marks, Row
+from bench.scoring.score_files import Report, Scores
+from bench.tables.model import DASH, Cell, Marks, Row
 from bench.tables.paper import MEAN, Cells, Mismatch
-from bench.tables.results import Kind, Results, Sampled, Series, averaged, kind_of
-from bench.tables.spec import PAPER_METHODS, PUBLISHED, REFERENCE, TABLE_1
+from bench.tables.results import (
+    Kind,
+    Place,
+    Results,
+    Sampled,
+    Series,
+    averaged,
+    kind_of,
+    series_of,
+)
+from bench.tables.spec import (
+    PAPER_METHODS,
+    PUBLISHED,
+    READINGS,
+    REFERENCE,
+    TABLE_1,
+)
 from scapo.text import one_line
-
-DATASET_ORDER = "label-order=dataset"
 
 
 def printed_rows(
@@ -45,43 +59,77 @@ def printed_rows(
     return rows
 
 
-def listed_series(results: Results, kind: Kind, *, with_order: bool) -> list[Series]:
-    """Rows of ours: every method and variant, the references, and S with one order per data set."""
-    plain = [series for series in results.series(kind) if not series.switches]
-    plain += [
-        Series(name, "", "") for name in REFERENCE if all(series.method != name for series in plain)
-    ]
-    others = [
-        series for series in results.series(kind) if series.switches not in ("", DATASET_ORDER)
-    ]
-    if with_order:
-        others += [
-            replace(series, switches=DATASET_ORDER)
-            for series in plain
-            if series.method not in REFERENCE
-        ]
-    return sorted(plain + others)
-
-
 def our_row(
-    results: Results, series: Series, parts: Sequence[Sampled | None], *, mean: bool = True
+    results: Results, line: Line, parts: Sequence[Sampled | None], *, mean: bool = True
 ) -> Row:
     """A cell per category and, if wanted, their mean."""
     cells = [Cell() if part is None else part.cell for part in parts]
     seeds = max((len(part.per_seed) for part in parts if part is not None), default=0)
+    row = line_row(results, line, (*cells, averaged(parts)) if mean else cells)
+    return replace(row, seeds=seeds)
+
+
+def line_row(results: Results, line: Line, cells: Sequence[Cell]) -> Row:
+    """A row of ours with these cells."""
+    series = line.series
     return Row(
-        method=display_name(series),
+        method=line.name,
         source="ours",
         marks=marks_of(results, series),
-        cells=(*cells, averaged(parts)) if mean else tuple(cells),
-        ranked=series.method not in REFERENCE and not series.switches,
-        seeds=seeds,
+        camera=camera_of(results, series),
+        cells=tuple(cells),
+        ranked=series.method not in REFERENCE and not series.switches and line.ranked,
+        plain=display_name(replace(series, switches="")) if series.switches else "",
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """A row to be: a series on all samples of its places, or on some."""
+
+    series: Series
+    name: str
+    unseen: bool = False
+    """On the objects unlike those of training."""
+    trait: str = ""
+    """Of these alone, if any."""
+    ranked: bool = True
+
+    def runs(self, results: Results, place: Place) -> list[Scores]:
+        """Its runs at a place, by seed."""
+        found = results.runs(self.series, replace(place, unseen=self.unseen))
+        if not self.trait:
+            return found
+        return [few for run in found if len((few := run.of_trait(self.trait)).samples)]
+
+
+def lines_of(results: Results, *kinds: Kind) -> list[Line]:
+    """Every series scored on data of these kinds, further readings too."""
+    found = sorted({series for kind in kinds for series in results.series(kind)})
+    return [Line(series=series, name=display_name(series)) for series in found]
+
+
+def kept(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """The rows to print, in order.
+
+    None without a number, and none of a further reading that only repeats the row it belongs to.
+    """
+    plain = {row.method: row for row in rows if row.source == "ours" and not row.plain}
+    return tuple(
+        row
+        for row in in_order(rows)
+        if not row.empty and not (row.plain in plain and row.repeats(plain[row.plain]))
     )
 
 
 def titles() -> dict[str, tuple[str, int]]:
     """Names of methods in scores -> what a table calls them, and their rank."""
     return PUBLISHED | {name: (one.title, one.rank) for name, one in all_methods().items()}
+
+
+def _ranked() -> list[str]:
+    """What tables call the methods, by rank."""
+    return [name for name, _ in sorted(titles().values(), key=lambda one: one[1])]
 
 
 def title(method: str) -> str:
@@ -94,27 +142,37 @@ def display_name(series: Series) -> str:
     name = title(series.method)
     if series.variant not in ("", "default"):
         name += f" ({series.variant})"
-    if series.switches == DATASET_ORDER:
-        name += ", one part order"
-    elif series.switches:
-        name += f", {series.switches}"
+    if series.switches:
+        name += f", {READINGS.get(series.switches, series.switches)}"
     return name
+
+
+def _runs_of(results: Results, series: Series) -> list[Scores]:
+    """Every run of a method in a variant, whatever its reading."""
+    return [
+        run
+        for run in results.all_runs()
+        if (run.run.method, run.run.variant.partition("[")[0]) == (series.method, series.variant)
+    ]
 
 
 def marks_of(results: Results, series: Series) -> Marks | None:
     """The labels that training used, from the reports beside the scores."""
-    for run in results.all_runs():
-        same = (run.run.method, run.run.variant.partition("[")[0]) == (
-            series.method, series.variant)  # fmt: skip
-        if same and series.method not in REFERENCE:
-            labels = run.report.supervision
-            return ("pose" in labels, "segmentation" in labels, "joint" in labels)
+    for run in _runs_of(results, series):
+        labels = run.report.supervision
+        return ("pose" in labels, "segmentation" in labels, "joint" in labels)
     return None
+
+
+def camera_of(results: Results, series: Series) -> bool | None:
+    """Whether it uses where the camera stands; None where a run does not say or two differ."""
+    said = {run.report.camera for run in _runs_of(results, series)}
+    return said.pop() if len(said) == 1 else None
 
 
 def in_order(rows: Sequence[Row]) -> list[Row]:
     """By the rank of methods, each printed row before ours of that method; references last."""
-    order = [name for name, _ in sorted(titles().values(), key=lambda one: one[1])]
+    order = _ranked()
 
     def rank(row: Row) -> tuple[int, int]:
         known = [i for i, name in enumerate(order) if row.method.startswith(name)]
@@ -130,38 +188,97 @@ def general_notes() -> tuple[str, ...]:
         "Rows marked paper are as printed, on other data: for orientation. Means of our rows are "
         "computed from unrounded cells and empty unless every category was run.",
         "† A printed mean that the cells of its own row do not give.",
+        "Pose, Seg., Joint: labels that training used; Camera: whether where the camera stands is "
+        "used (– not said). Constant and Oracle pose are no methods: the means of the training "
+        "labels, placed at the cloud's centroid or at the true pose of the base.",
         "Bold: best among self-supervised rows (fewer than three check marks), printed and ours "
         "apart. – does not exist or was not run.",
         "In brackets: 95 % bootstrap interval, resampled by instance; ± standard deviation over "
         "training seeds.",
         "The part order is chosen per sample, which flatters two-part methods; rows with one part "
-        "order choose it once per data set.",
+        "order choose it once per data set. Ambiguity-aware rows are scored against the best of "
+        "the turns that nobody can tell from the truth (docs/ambiguity.md). Both stand only where "
+        "they differ from the row they belong to.",
     )
 
 
+def left_out(
+    results: Results, candidates: Sequence[tuple[str, Sequence[Row]]], *kinds: Kind
+) -> tuple[str, ...]:
+    """One line on what was not run, or has no value: nothing where all is there.
+
+    Args:
+        results: All scores.
+        candidates: Of each block what it is called, and its rows, printed or not.
+        kinds: Of the table's data.
+    """
+    series = {one for kind in kinds for one in results.series(kind)}
+    run = {title(one.method) for one in series}
+    names = dict.fromkeys((*REFERENCE.values(), *_ranked()))
+    missing = {"Not run": [name for name in names if name not in run]}
+    plain = sorted(one for one in series if not one.switches)
+    for reading, words in READINGS.items():
+        missing[f"Not scored as {words}"] = [
+            display_name(one) for one in plain if replace(one, switches=reading) not in series
+        ]
+    empty: dict[str, list[str]] = {}
+    for symbol, rows in candidates:
+        for row in rows:
+            if row.empty and not row.plain:
+                name = row.method if row.source == "ours" else f"{row.method} as printed"
+                empty.setdefault(name, []).append(symbol)
+    sentences = [f"{what}: {'; '.join(words)}." for what, words in missing.items() if words]
+    if empty:
+        told = (f"{name} ({', '.join(symbols)})" for name, symbols in empty.items())
+        sentences.append(f"Without a value: {'; '.join(told)}.")
+    return (" ".join(sentences),) if sentences else ()
+
+
 def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tuple[str, ...]:
-    """One line per run series: seeds, data and what its header says of its cost."""
+    """One line per run series: seeds, data, labels and what its header says of its cost."""
     lines: dict[str, set[int]] = {}
-    for run in results.all_runs():
+    for run in results.all_runs(unseen=False):
         if (
             kind_of(run.run.data) != kind
             or run.run.category not in categories
             or "[" in run.run.variant
         ):
             continue
-        budget = run.report.budget
-        named = {_short(key.replace("_", " ")): value for key, value in sorted(budget.items())}
-        cost = ", ".join(f"{key} {_short(value)}" for key, value in named.items())
-        name = title(run.run.method)
-        variant = f" ({run.run.variant})" if run.run.variant else ""
+        name = display_name(series_of(run))
         text = (
-            f"{name}{variant}, {run.run.category} on {run.run.data}, "
-            f"{len(run.samples)} samples; budget: {cost or 'not stated'}"
+            f"{name}, {run.run.category} on {run.run.data} ({run.run.split}), "
+            f"{len(run.samples)} samples; labels: {', '.join(run.report.supervision) or 'none'}; "
+            f"{_cost(run.report)}"
         )
         lines.setdefault(text, set()).add(run.run.seed)
     return tuple(
         f"{text}; seeds {', '.join(map(str, sorted(seeds)))}." for text, seeds in lines.items()
     )
+
+
+TOLD = ("device", "processor", "batch", "seconds_per_cloud")
+"""Of a budget: what is told of every row, said or not."""
+
+
+def _cost(report: Report) -> str:
+    """What the predictions say of their cost, as text."""
+    seconds = report.cost("seconds_per_cloud")
+    told = [
+        f"device {_said(report, 'device')}",
+        *([f"processor {_said(report, 'processor')}"] if "processor" in report.budget else []),
+        f"batch {_said(report, 'batch')}",
+        f"seconds per cloud {DASH if seconds is None else _short(seconds)}",
+    ]
+    others = [
+        f"{_short(key.replace('_', ' '))} {_short(value)}"
+        for key, value in sorted(report.budget.items())
+        if key not in TOLD
+    ]
+    return f"{', '.join(told)}; budget: {', '.join(others) or 'not stated'}"
+
+
+def _said(report: Report, name: str) -> str:
+    return _short(report.budget[name]) if name in report.budget else DASH
 
 
 def _short(value: object) -> str:

@@ -7,6 +7,7 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from itertools import combinations
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -15,8 +16,8 @@ from bench.metrics import ApRule
 from bench.scoring.score_files import Scores
 from bench.scoring.summary import passes
 from bench.statistics import Paired, paired
-from bench.tables.results import Place, Results, series_of
-from bench.tables.spec import TABLE_1
+from bench.tables.results import Kind, Place, Results, series_of
+from bench.tables.spec import REFERENCE, TABLE_1
 from scapo.text import as_cell
 
 COLUMNS = (
@@ -44,12 +45,12 @@ def significance_csv(results: Results, rule: ApRule = "mean") -> str:
 
 
 def _pairs(results: Results) -> Iterator[tuple[list[Scores], list[Scores]]]:
-    """Two series on the same place, default readings only."""
-    for kind in ("clean", "sensor"):
-        series = [s for s in results.series(kind) if not s.switches]
-        places = sorted({run.run.category for run in results.all_runs()})
+    """Two methods on the same place, default readings only."""
+    for kind in get_args(Kind):
+        series = [s for s in results.series(kind)
+                  if not s.switches and s.method not in REFERENCE]  # fmt: skip
         for a, b in combinations(series, 2):
-            for category in places:
+            for category in results.categories(kind):
                 found = [results.runs(s, Place(kind, category)) for s in (a, b)]
                 if all(found) and np.array_equal(found[0][0].samples, found[1][0].samples):
                     yield found[0], found[1]

@@ -43,6 +43,15 @@ TABLE_1 = (
             printed=False),
 )  # fmt: skip
 """The last two are ours alone."""
+SWAPPED = Measure(key="swapped", symbol="O", heading="samples whose parts were taken in another "
+                  "order, %", metric="order", unit="1", factor=100, decimals=1, higher=False,
+                  printed=False)  # fmt: skip
+"""How often the order of the parts was chosen for the sample: neither end is better."""
+SECONDS = "Seconds per cloud"
+DATASET_ORDER, AMBIGUITY = "label-order=dataset", "ambiguity=on"
+"""Readings that `evaluate` writes beside its own, as a variant's brackets name them."""
+READINGS = {DATASET_ORDER: "one part order", AMBIGUITY: "ambiguity-aware"}
+"""What tables call them."""
 
 TABLE_1_CATEGORIES = ("laptop", "safe", "eyeglasses", "oven", "washer")
 TABLE_1_GROUPS = (("HOI4D", 2), ("Shape2Motion", 3))
@@ -78,5 +87,5 @@ PAPER_METHODS = {"Ours": "SCAPO", "OP-Align(SJ)": "OP-Align"}
 """Names of `paper.csv` that differ from ours."""
 
 REFERENCE = {"constant": "Constant prediction", "oracle-pose": "Oracle pose"}
-"""Rows that are no method: what a constant answer scores, and what true poses would. Not ranked,
-and printed with every table, run or not."""
+"""Rows that are no method: what a constant answer scores, and what true poses would. Not ranked;
+`evaluate` scores them with every method."""

@@ -1,56 +1,48 @@
 # SPDX-License-Identifier: MIT
-"""Tables 1, 2 and 3 from scores per sample, the paper's printed numbers beside ours.
+"""All tables from scores per sample.
 
-Table 4 is ours: the metrics of Table 1 on the categories that the paper scores by precision alone.
+Tables 1, 2 and 3 have the paper's printed numbers beside ours, Table 1 stands on each kind of data,
+and 4 to 6 are ours alone (`bench.tables.means`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from bench.metrics import ApRule
-from bench.tables.means import table_4
+from bench.tables.means import table_1, table_4, table_5, table_6
 from bench.tables.model import Block, Cell, Row, Table, mark_best
-from bench.tables.paper import MEAN, Cells, Mismatch, mean_mismatches, printed_cells
+from bench.tables.paper import MEAN, Cells, mean_mismatches, printed_cells
 from bench.tables.precision import table_2
 from bench.tables.render import to_csv, to_latex, to_markdown
-from bench.tables.results import Place, Results, Series, averaged, load, measured
-from bench.tables.rows import (
-    budget_notes,
-    general_notes,
-    in_order,
-    listed_series,
-    our_row,
-    printed_rows,
-)
+from bench.tables.results import TABLE_SPLIT, Place, Results, averaged, load, measured
+from bench.tables.rows import Line, budget_notes, general_notes, line_row, lines_of
 from bench.tables.significance import significance_csv
-from bench.tables.spec import (
-    ABLATION_NAMES,
-    ABLATIONS,
-    TABLE_1,
-    TABLE_1_CATEGORIES,
-    TABLE_1_GROUPS,
-    TABLE_3,
-    Measure,
-)
+from bench.tables.spec import ABLATION_NAMES, ABLATIONS, TABLE_1_CATEGORIES, TABLE_3
 from scapo.store import write_bytes
 
 
-def build(results: Results, rule: ApRule = "mean") -> tuple[Table, Table, Table, Table]:
-    """The paper's three tables, and the mean errors that they leave out."""
+def build(results: Results, rule: ApRule = "mean") -> tuple[Table, ...]:
+    """The paper's three tables, and those of ours alone."""
     cells = printed_cells()
     wrong = mean_mismatches(cells)
     return (
-        table_1(results, cells, wrong),
+        table_1(results, "clean", cells, wrong),
         table_2(results, cells, wrong, rule),
         table_3(results, cells),
         table_4(results),
+        table_1(results, "complete", cells, wrong),
+        table_1(results, "isolated", cells, wrong),
+        table_5(results),
+        table_6(results),
     )
 
 
-def make_tables(scores: Path, out: Path, rule: ApRule = "mean") -> list[Path]:
-    """Write `table{1,2,3,4}.{md,csv,tex}` and `significance.csv` from a folder of scores.
+def make_tables(
+    scores: Path, out: Path, rule: ApRule = "mean", split: str = TABLE_SPLIT
+) -> list[Path]:
+    """Write `tableNUMBER.{md,csv,tex}` of all tables and `significance.csv` from scores.
 
     Returns:
         Their paths.
@@ -58,7 +50,7 @@ def make_tables(scores: Path, out: Path, rule: ApRule = "mean") -> list[Path]:
     Raises:
         StoreError: No such folder, or scores that are damaged or do not fit together.
     """
-    results = load(scores)
+    results = load(scores, split)
     written: dict[Path, str] = {}
     for table in build(results, rule):
         stem = f"table{table.number}"
@@ -71,40 +63,8 @@ def make_tables(scores: Path, out: Path, rule: ApRule = "mean") -> list[Path]:
     return list(written)
 
 
-def table_1(results: Results, cells: Cells, wrong: Sequence[Mismatch]) -> Table:
-    """Mean errors on `clean`, a block per metric."""
-    blocks = [_block_1(results, cells, wrong, measure) for measure in TABLE_1]
-    return Table(
-        number=1,
-        title="Synthetic objects: segmentation (S), joint direction (D) and pivot (C), part "
-        "rotation (R) and translation (t)",
-        first="Metric",
-        groups=(*TABLE_1_GROUPS, ("", 1)),
-        columns=(*(name.capitalize() for name in TABLE_1_CATEGORIES), "Mean"),
-        blocks=tuple(mark_best(block) for block in blocks),
-        notes=(*general_notes(), *budget_notes(results, "clean", TABLE_1_CATEGORIES)),
-    )
-
-
-def _block_1(results: Results, cells: Cells, wrong: Sequence[Mismatch], measure: Measure) -> Block:
-    rows = printed_rows(cells, wrong, "1", measure.key, (*TABLE_1_CATEGORIES, MEAN))
-    rows += [
-        our_row(results, series, [
-            measured(results.runs(series, Place("clean", name)), measure, seed)
-            for seed, name in enumerate(TABLE_1_CATEGORIES)
-        ])
-        for series in listed_series(results, "clean", with_order=measure.metric == "iou")
-    ]  # fmt: skip
-    arrow = "↑" if measure.higher else "↓"
-    return Block(
-        heading=f"{measure.symbol} {arrow} ({measure.heading})",
-        rows=tuple(in_order(rows)),
-        higher=(measure.higher,) * (len(TABLE_1_CATEGORIES) + 1),
-    )
-
-
 def table_3(results: Results, cells: Cells) -> Table:
-    """The ablations: means over the five categories of Table 1."""
+    """The ablations: means over the five categories of Table 1, single views."""
     rows: list[Row] = []
     for ablation in ABLATIONS:
         printed = [cells["3", measure.key, ablation, MEAN] for measure in TABLE_3]
@@ -113,23 +73,31 @@ def table_3(results: Results, cells: Cells) -> Table:
             cells=tuple(Cell(value=cell.value, text=cell.text) for cell in printed),
         ))  # fmt: skip
         rows += [
-            _ablation_row(results, series, ablation)
-            for series in results.series("clean")
-            if series.method == "scapo"
-            and not series.switches
-            and ablation_of(series.variant) == ablation
+            _ablation_row(results, line, ablation)
+            for line in lines_of(results, "clean")
+            if line.series.method == "scapo"
+            and not line.series.switches
+            and ablation_of(line.series.variant) == ablation
         ]
     block = Block(
-        heading="Loss", rows=tuple(rows), higher=tuple(measure.higher for measure in TABLE_3)
+        heading="Loss",
+        rows=tuple(row for row in rows if not row.empty),
+        higher=tuple(measure.higher for measure in TABLE_3),
     )
+    missing = [row.method for row in rows if row.empty]
+    note = f"Without a mean, as not every category was run: {', '.join(missing)}."
     return Table(
-        number=3,
+        number="3",
         title="Ablation of SCAPO's regularisers, means over the categories of Table 1",
         first="",
         groups=(),
         columns=tuple(f"{m.symbol} {'↑' if m.higher else '↓'}" for m in TABLE_3),
         blocks=(mark_best(block),),
-        notes=(*general_notes(), *budget_notes(results, "clean", TABLE_1_CATEGORIES)),
+        notes=(
+            *general_notes(),
+            *([note] if missing else []),
+            *budget_notes(results, "clean", TABLE_1_CATEGORIES),
+        ),
     )
 
 
@@ -139,16 +107,13 @@ def ablation_of(variant: str) -> str:
     return next((a for a in ABLATIONS[1:] if name.endswith(a)), ABLATIONS[0])
 
 
-def _ablation_row(results: Results, series: Series, ablation: str) -> Row:
+def _ablation_row(results: Results, line: Line, ablation: str) -> Row:
     cells: list[Cell] = []
     for measure in TABLE_3:
-        runs = [results.runs(series, Place("clean", name)) for name in TABLE_1_CATEGORIES]
+        runs = [line.runs(results, Place("clean", name)) for name in TABLE_1_CATEGORIES]
         parts = [measured(found, measure, seed) for seed, found in enumerate(runs)]
         cells.append(averaged(parts))
-    suffix = f" ({series.variant})" if series.variant not in ("", "default") else ""
-    return Row(
-        method=ABLATION_NAMES[ablation] + suffix,
-        source="ours",
-        marks=(False, False, False),
-        cells=tuple(cells),
-    )
+    variant = line.series.variant
+    suffix = f" ({variant})" if variant not in ("", "default") else ""
+    row = line_row(results, line, cells)
+    return replace(row, method=ABLATION_NAMES[ablation] + suffix)

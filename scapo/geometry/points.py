@@ -163,10 +163,11 @@ def farthest_points(
 def _spread(points: Float[Tensor, "*B N D"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
     chosen = torch.full(points.shape[:-2], start, device=points.device)
     distance = torch.full(points.shape[:-1], torch.inf, dtype=points.dtype, device=points.device)
+    columns = points.movedim(-1, 0).contiguous()  # sums over a short last dimension take longer
     indices = [chosen]
     for _ in range(count - 1):
-        latest = gather(points, chosen[..., None])
-        distance = torch.minimum(distance, (points - latest).square().sum(-1))
+        latest = gather(points, chosen[..., None]).movedim(-1, 0)
+        distance = torch.minimum(distance, (columns - latest).square().sum(0))
         chosen = distance.argmax(-1)
         indices.append(chosen)
     return torch.stack(indices, -1)

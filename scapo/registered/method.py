@@ -7,10 +7,11 @@ its placements in the most confident ones. Outliers of the clouds are left out (
 label is used anywhere: templates, hypotheses and confidence come from the loss of the views alone.
 Camera positions of the training clouds are known (their frame's origin).
 
-`fast` is the network alone, which sees the points only; `refine` fits the template to the cloud
-from the network's four hypotheses and the best of a grid. For that it asks where the camera was:
-at the origin of the cloud's frame or at `Observation.sensor`, or (`camera="estimated"`) where the
-network believes it.
+`fast` is the network alone, which sees the points only. `quick` and `refine` fit the template to
+the cloud from hypotheses that two banks of images propose (`view_bank`): `quick` a few in a few
+steps, `refine` more of them to the end. For that they ask where the camera was: at the origin of
+the cloud's frame or at `Observation.sensor`, or (`camera="estimated"`) where the network believes
+it.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import DiscoveryConfig, TemplateConfig
-from scapo.registered.decode import nearest_weights, placed_prediction
+from scapo.registered.decode import coarse_weights, nearest_weights, placed_prediction, soft_parts
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
@@ -40,19 +41,22 @@ from scapo.registered.network import (
     PointVotes,
     Target,
     Votes,
+    own_frame,
     principal_frames,
     procrustes,
     vote_losses,
 )
 from scapo.registered.outliers import inlier_mask, replaced
-from scapo.registered.pairwise import rotation_grid
 from scapo.registered.pose_search import (
+    BRIEF,
     CHARGED,
+    THOROUGH,
     SearchResult,
     SearchSpace,
     grid_of_states,
+    light,
+    modes_of,
     most_confident,
-    propose,
     refine_states,
     successive_halving,
 )
@@ -60,10 +64,10 @@ from scapo.registered.pseudo_labels import PseudoLabels
 from scapo.registered.template import (
     ArticulatedTemplate,
     Placement,
-    interleave,
     slides,
     turn_placement,
 )
+from scapo.registered.view_bank import ShownPoints, ViewBank
 from scapo.registered.views import NEIGHBOURS, PartialViews, observe
 from scapo.types import Labels, Observation, Prediction, Supervision
 
@@ -97,14 +101,17 @@ class SearchConfig:
     """Width of the network's layers; 48 gives 0.2 million parameters."""
     points: int = 256
     """Points of each cloud that the network and the search see."""
-    grid_hypotheses: int = 64
-    """Placements of a grid search that `refine` tries beside the network's four; 0 for none."""
+    grid_hypotheses: int = 32
+    """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
+    and were placed in training, half as of images of the template; 0: the network's four."""
+    quick_hypotheses: int = 12
+    """The same for `quick`."""
     strays: Literal["out", "kept"] = "out"
     """Whether outliers, points that do not belong to the object, are left out."""
     settle: bool = True
     """Try all states again for the placement that won."""
     camera: Literal["known", "estimated"] = "known"
-    """Whether `refine` takes the camera from the cloud's frame or from the network."""
+    """Whether `quick` and `refine` take the camera from the cloud's frame or from the network."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,6 +161,9 @@ class AbstractRegistered(AbstractMethod):
                 for parameter in layer.parameters():
                     nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.pseudo = PseudoLabels()
+        self._drawn: (
+            tuple[list[tuple[int, int, torch.device]], tuple[SearchSpace, Tensor]] | None
+        ) = None
 
     @property
     def variant(self) -> str:
@@ -239,6 +249,7 @@ class AbstractRegistered(AbstractMethod):
         away = views.camera - placement.translation
         camera = (placement.rotation.mT @ away[..., None])[..., 0]
         self.pseudo.set(key, placement, camera, trust)
+        self.pseudo.show(ShownPoints.of(views))
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`vote_losses`)."""
@@ -330,72 +341,94 @@ class AbstractRegistered(AbstractMethod):
         """Parts, poses and joints."""
         cloud = observation.points.to(self.template.points)
         clean, similarity = normalise(replaced(cloud, self._inlier_mask(cloud)))
-        points, kept = similarity.forward(cloud), self._thinned(clean)
-        placement, (votes, sure) = self._hypotheses(kept)
-        best = sure.argmax(1)
-        every = torch.arange(len(points), device=points.device)
-        row = every * FRAMES + best
-        confidence = sure.gather(1, best[:, None])[:, 0]
+        points = similarity.forward(cloud)
         if mode == "fast":
-            near = nearest(points, kept)
-            weight = gather(votes.part[row].softmax(-1), near)
-            chosen = take(placement, row)
+            kept = self._thinned(clean)
+            chosen, votes, confidence = self._surest(kept)
+            weight = gather(votes.part.softmax(-1), nearest(points, kept))
+            return self._prediction(chosen, weight, similarity, confidence)
+        index = farthest_points(clean, min(self.config.points, clean.shape[1]))
+        kept = gather(clean, index)
+        camera, frame = self._camera(observation, similarity, kept), own_frame(kept)
+        turned = (frame @ camera[..., None])[..., 0]
+        views = observe(clean @ frame.mT, turned, index=index)
+        chosen, confidence = self._searched(views, mode)
+        points = points @ frame.mT
+        if mode == "quick":
+            weight = coarse_weights(self.template, points, chosen, views, self._space()[1])
         else:
-            camera = self._camera(observation, similarity, take(placement, row), votes.camera[row])
-            frame = principal_frames(kept)[every, best]
-            chosen, confidence = self._refined(clean, camera, frame, placement)
-            weight = nearest_weights(self.template, points, chosen, camera)
+            weight = nearest_weights(self.template, points, chosen, turned)
+        chosen = turn_placement(chosen, frame.mT)
         return self._prediction(chosen, weight, similarity, confidence)
 
+    def _surest(self, kept: Float[Tensor, "B K 3"]) -> tuple[Placement, Votes, Float[Tensor, " B"]]:
+        """The network's placement in the frame in which it is surest, its votes, how sure it is."""
+        placement, (votes, sure) = self._hypotheses(kept)
+        best = sure.argmax(1)
+        row = torch.arange(len(kept), device=kept.device) * FRAMES + best
+        return take(placement, row), take(votes, row), sure.gather(1, best[:, None])[:, 0]
+
     def _camera(
-        self, observation: Observation, similarity: Similarity, placement: Placement, vote: Tensor
+        self, observation: Observation, similarity: Similarity, kept: Float[Tensor, "B K 3"]
     ) -> Float[Tensor, "B 3"]:
         """The camera's centre in the normalised frame of each cloud."""
         if self.config.camera == "estimated":
-            return (placement.rotation @ vote[..., None])[..., 0] + placement.translation
+            placement, votes, _ = self._surest(kept)
+            return (placement.rotation @ votes.camera[..., None])[..., 0] + placement.translation
         sensor = observation.sensor
         away = -similarity.centre if sensor is None else sensor - similarity.centre
         return away * similarity.scale[:, None]
 
-    def _refined(
-        self,
-        points: Float[Tensor, "B N 3"],
-        camera: Float[Tensor, "B 3"],
-        frame: Float[Tensor, "B 3 3"],
-        proposed: Placement,
-    ) -> tuple[Placement, Float[Tensor, " B"]]:
-        """The best hypothesis of network and grid after a few steps, and its margin.
+    def _searched(self, views: PartialViews, mode: Mode) -> tuple[Placement, Float[Tensor, " B"]]:
+        """The best hypothesis after a few steps, and its margin.
 
-        All happens in the principal frame in which the network is surest, so that the grids of
-        rotations and of the depth image turn with the cloud.
+        All happens in a frame of the cloud's own, so that grids of rolls and of the depth image
+        turn with it.
         """
-        turned = (frame @ camera[..., None])[..., 0]
-        views = observe(points @ frame.mT, turned, count=self.config.points)
-        start, space = [turn_placement(proposed, frame.repeat_interleave(FRAMES, 0))], self._space()
-        if self.config.grid_hypotheses:
-            start.append(propose(self.template, views, space))
-        hypotheses = interleave(start, len(points))
-        left = successive_halving(self.template, views, hypotheses, space.states)
+        space, quick = self._space()[0], mode == "quick"
+        effort = BRIEF if quick else THOROUGH
+        count = self.config.quick_hypotheses if quick else self.config.grid_hypotheses
+        start = space.propose(views, count) if count else self._hypotheses(views.points)[0]
+        left = successive_halving(self.template, views, start, space, effort)
         found = left.best(self._limits().wider(CHARGED))
         final = found.placement
-        if self.config.settle:
+        if self.config.settle and not quick:
             final = refine_states(self.template, views, found, self._limits())
         if self.template.deviates():
             final, _ = refine_deviations(self.template, views, final)
-        return turn_placement(final, frame.mT), found.margin
+        return final, found.margin
 
     def _limits(self) -> JointLimits:
         """Of the training views that the network learned."""
         return limits_of(self.pseudo.state[self.pseudo.trust > 0], self.template.kinds)
 
-    def _space(self) -> SearchSpace:
-        """States and cameras of the training views that the network learned."""
+    def _space(self) -> tuple[SearchSpace, Float[Tensor, "M P"]]:
+        """States, shifts, sizes and cameras of the training views that the network learned.
+
+        What is seen of the template from there is drawn once; with it come its `soft_parts`.
+        """
+        shape = [*self.template.state_dict(keep_vars=True).values(), *self.pseudo.buffers()]
+        key = [(id(tensor), tensor._version, tensor.device) for tensor in shape]
+        if self._drawn is None or self._drawn[0] != key:
+            self._drawn = key, (self._draw(), soft_parts(self.template))
+        return self._drawn[1]
+
+    def _draw(self) -> SearchSpace:
         learned = self.pseudo.trust > 0
+        states = grid_of_states(self._limits().wider(ROOM))
+        placement = take(self.pseudo.placement(), learned)
+        camera = F.normalize(self.pseudo.camera[learned], dim=-1)
+        placed = None
+        if len(self.pseudo.points):
+            shown = ShownPoints(
+                points=self.pseudo.points[learned], normals=self.pseudo.normals[learned]
+            )
+            placed = ViewBank.placed(self.template, shown, placement, camera)
+        modes = modes_of(placement, states)
         return SearchSpace(
-            states=grid_of_states(self._limits().wider(ROOM)),
-            rotations=rotation_grid(self.config.discovery.rotations).to(self.pseudo.camera),
-            cameras=F.normalize(self.pseudo.camera[learned], dim=-1),
-            keep=self.config.grid_hypotheses,
+            rendered=ViewBank.rendered(light(self.template), modes, camera),
+            placed=placed,
+            states=states,
         )
 
 

@@ -105,6 +105,16 @@ def principal_frames(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 4 3 3"]
     return signs[:, :, None] * frame[:, None]
 
 
+def own_frame(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 3 3"]:
+    """That of the principal frames along whose axes the cloud reaches farthest, by third moments.
+
+    It turns with the cloud, as all four do together.
+    """
+    frames = principal_frames(points)
+    skew = (points[:, None] @ frames.mT).pow(3).sum((-1, -2))
+    return frames[torch.arange(len(points), device=points.device), skew.argmax(1)]
+
+
 def procrustes(
     target: Float[Tensor, "B K 3"], source: Float[Tensor, "B K 3"], weight: Float[Tensor, "B K"]
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:

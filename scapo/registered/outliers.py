@@ -8,8 +8,12 @@ which sparse views are filled up, count for the size of a cluster but not for wh
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from scapo.geometry.points import nearest
@@ -43,17 +47,26 @@ def _inliers(cloud: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
 
 
 def _clusters(points: Float[Tensor, "M 3"]) -> Int[Tensor, " M"]:
-    """The smallest index of all points that are connected to each by short steps."""
-    gap = torch.cdist(points, points)
-    spacing = gap.kthvalue(min(SPACING, len(points)), dim=1).values.median()
-    apart = (gap > REACH * spacing).fill_diagonal_(False)
-    label = torch.arange(len(points), device=points.device)
-    while True:
-        around = label.expand(len(points), -1).masked_fill(apart, len(points)).amin(1)
-        around = around[around]
-        if bool((around == label).all()):
-            return label
-        label = around
+    """A number for each point, the same for all that short steps connect."""
+    found = points.cpu().numpy()
+    tree = KDTree(found)
+    gap, near = tree.query(found, k=min(SPACING, len(found)))
+    gap, near = gap.reshape(len(found), -1), near.reshape(len(found), -1)
+    reach = REACH * float(torch.from_numpy(gap[:, -1]).median())
+    rows, columns = np.nonzero(gap <= reach)
+    label = _connected(rows, near[rows, columns], len(found))
+    if label.any():  # not all in one piece by the nearest alone: all short steps are asked
+        pairs = tree.query_pairs(reach, output_type="ndarray")
+        label = _connected(pairs[:, 0], pairs[:, 1], len(found))
+    return torch.from_numpy(label).to(points.device, torch.long)
+
+
+def _connected(
+    rows: Int[np.ndarray, " E"], columns: Int[np.ndarray, " E"], count: int
+) -> Int[np.ndarray, " {count}"]:
+    """Number of the connected component of each point, from 0 on."""
+    edges = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(count, count))
+    return connected_components(edges, directed=False)[1]
 
 
 def replaced(points: Float[Tensor, "B N 3"], inlier: Bool[Tensor, "B N"]) -> Float[Tensor, "B N 3"]:

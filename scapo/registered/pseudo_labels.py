@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from scapo.registered.template import Placement
+from scapo.registered.view_bank import ShownPoints
 
 
 class PseudoLabels(nn.Module):
@@ -25,14 +26,18 @@ class PseudoLabels(nn.Module):
     """Centres in the template frame."""
     trust: Tensor
     """Weight of each when the network learns."""
+    points: Tensor
+    """(B, K, 3) some points of each, normalised; none where a checkpoint has none."""
+    normals: Tensor
     belonging: Tensor
     """Which points of each cloud are inliers (bool)."""
     PLACEMENT: ClassVar = ("rotation", "translation", "log_scale", "state", "shift")
     NAMES: ClassVar = ("key", *PLACEMENT, "camera", "trust")
+    SHOWN: ClassVar = ("points", "normals")
 
     def __init__(self) -> None:
         super().__init__()
-        for name in self.NAMES:
+        for name in (*self.NAMES, *self.SHOWN):
             self.register_buffer(name, torch.zeros(0))
         self.register_buffer("belonging", torch.ones(0, 0, dtype=torch.bool))
 
@@ -41,6 +46,10 @@ class PseudoLabels(nn.Module):
         values = (key, *(getattr(placement, name) for name in self.PLACEMENT), camera, trust)
         for name, value in zip(self.NAMES, values, strict=True):
             setattr(self, name, value.detach().clone())
+
+    def show(self, shown: ShownPoints) -> None:
+        """Keep what the clouds look like."""
+        self.points, self.normals = shown.points.clone(), shown.normals.clone()
 
     def placement(self) -> Placement:
         """All of them, about the category's axes."""
@@ -54,8 +63,10 @@ class PseudoLabels(nn.Module):
         *rest: Any,  # noqa: ANN401 - as torch calls it
         **named: Any,  # noqa: ANN401
     ) -> None:
-        """Take the size of what is loaded."""
-        for name in (*self.NAMES, "belonging"):
+        """Take the size of what is loaded; older checkpoints have no points."""
+        for name in self.SHOWN:
+            state_dict.setdefault(prefix + name, torch.zeros(0))
+        for name in (*self.NAMES, *self.SHOWN, "belonging"):
             if prefix + name in state_dict:
                 empty = torch.zeros_like(state_dict[prefix + name], device=self.key.device)
                 setattr(self, name, empty)

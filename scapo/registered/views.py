@@ -80,7 +80,11 @@ class PartialViews:
 
 @torch.no_grad()
 def observe(
-    points: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"], *, count: int = 256
+    points: Float[Tensor, "B N 3"],
+    camera: Float[Tensor, "B 3"],
+    *,
+    count: int = 256,
+    index: Int[Tensor, "B K"] | None = None,
 ) -> PartialViews:
     """The views of normalised clouds.
 
@@ -88,8 +92,11 @@ def observe(
         points: Mean radius 0.25 about the origin.
         camera: The camera's centre in the same frame; estimated or known.
         count: Points kept, or all where there are fewer.
+        index: Those points, where they are known (`farthest_points`).
     """
-    kept = gather(points, farthest_points(points, min(count, points.shape[1])))
+    if index is None:
+        index = farthest_points(points, min(count, points.shape[1]))
+    kept = gather(points, index)
     look = _look(camera)
     depth, centre, half = _depth_image(points, camera, look)
     return PartialViews(

@@ -147,6 +147,8 @@ DAMAGE = {
     "supervision a text": with_header(supervision="pose"),
     "supervision nested": with_header(supervision=[["pose"]]),
     "budget a text": with_header(budget="cheap"),
+    "camera a text": with_header(camera="yes"),
+    "camera a number": with_header(camera=1),
     "no tensors": lambda split, arrays: file_bytes({}, header_json(split)),
     "no segmentation": dropped("part"),
     "both segmentations": added(

@@ -7,6 +7,7 @@ its part's box, and a child's pose is the base's followed by the joint motion.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -185,3 +186,27 @@ def write_truth(path: Path, split: Split, **changes: Any) -> Path:
     """Predictions equal to the truth."""
     write_predictions(path, header_of(split, **changes), truth_as_prediction(split))
     return path
+
+
+def unambiguous(arrays: Arrays) -> Arrays:
+    """The same samples, said to look like no turn of themselves."""
+    pose, state = arrays["camera_T_part"], arrays["joint_state"]
+    count, parts = pose.shape[:2]
+    alike = np.zeros((count, 24), np.uint8)
+    alike[:, 0] = 1
+    return arrays | {
+        "alike": alike,
+        "alike_base": np.repeat(pose[:, :1], 24, 1),
+        "alike_state": np.repeat(state[:, None], 24, 1),
+        "alike_part": np.tile(np.arange(parts, dtype=np.uint8), (count, 24, 1)),
+    }
+
+
+def give_traits(split: Split, traits: list[str]) -> Split:
+    """The same split, each object with its trait."""
+    path = split.folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    for instance, trait in zip(manifest["instances"], traits, strict=True):
+        instance["trait"] = trait
+    path.write_text(json.dumps(manifest))
+    return Split(split.folder)

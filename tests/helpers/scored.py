@@ -15,7 +15,8 @@ SAMPLES, OBJECTS = 40, 8
 
 def make_scores(
     folder, method, category, *, seed=1, kind="clean", quality=1.0, supervision=(), variant="",
-    samples=SAMPLES, digest="0123456789ab",
+    samples=SAMPLES, digest="0123456789ab", split="test", budget=None, camera=None, traits=(),
+    order=None,
 ):  # fmt: skip
     """A scores file with random errors; larger `quality` is worse."""
     generator = np.random.default_rng([seed, len(category), len(method)])
@@ -32,13 +33,17 @@ def make_scores(
         ("part_translation", "m"): metres,
     }
     errors["iou", "1"][0] = np.nan
+    if order is not None:
+        errors["order", "1"] = order
     run = Run(method=method, variant=variant, seed=seed, data=f"{kind}@{digest}",
-              category=category, split="test")  # fmt: skip
-    path = folder / f"{kind}-{category}-{method}-{variant}-{seed}.csv.gz"
+              category=category, split=split)  # fmt: skip
+    path = folder / f"{kind}-{category}-{split}-{method}-{variant}-{seed}.csv.gz"
     with writing(path) as file:
         file.add(run, 0, {key: value[:15] for key, value in errors.items()})
         file.add(run, 15, {key: value[15:] for key, value in errors.items()})
-        file.report = report_of(run, supervision, samples)
+        own = {"camera": camera, "trait": list(traits) or None, "budget": budget}
+        known = {name: value for name, value in own.items() if value is not None}
+        file.report = report_of(run, supervision, samples) | known
     return errors
 
 

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,8 @@ import torch
 from bench.__main__ import main
 from bench.cli.verbs import prepare
 from bench.methods import METHODS, load
+from bench.requests import PredictRequest
+from bench.runs import predict as predicting
 from bench.runs.predict import to_arrays
 from bench.runs.train import pick_device
 from bench.scoring.predictions import Predictions, read_prediction_header
@@ -19,6 +24,7 @@ from scapo.method import OracleMethod
 from scapo.paper.method import Scapo
 from scapo.store import open_split
 from scapo.store.files import read, read_header
+from scapo.store.samples import SampleDataset
 from scapo.store.schema import StoreError
 from scapo.types import Prediction
 from tests.helpers.hinged import plates
@@ -115,6 +121,10 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
     assert header.data_digest == split.manifest.digest
     assert header.budget["parameters"] > 1000
     assert header.budget["training_seconds"] > 0
+    assert header.budget["seconds_per_cloud"] > 0
+    assert (header.budget["device"], header.budget["batch"]) == ("cpu", 2)
+    assert "cores" in header.budget["processor"]
+    assert header.camera is False
     trained = read_header(run / "checkpoint.safetensors")
     for name in ("commit", "config", "machine", "data_digest", "training", "seed"):
         assert header.run[name] == trained[name], name
@@ -122,6 +132,29 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
     command("predict", run, "--data", data, "--out", one, "--device", "cpu", "--batch", "5")
     for name, value in read(one)[0].items():
         np.testing.assert_allclose(value, read(out)[0][name], atol=1e-4)
+
+
+def test_the_time_of_a_cloud_is_the_methods_alone(
+    run: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that reading moves by 100 seconds and answering by two."""
+    now = [0.0]
+
+    def slowed(seconds: float, function: Callable[..., Any]) -> Callable[..., Any]:
+        def slow(*arguments: Any) -> Any:
+            now[0] += seconds
+            return function(*arguments)
+
+        return slow
+
+    monkeypatch.setattr(predicting, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(SampleDataset, "batch", slowed(100, SampleDataset.batch))
+    monkeypatch.setattr(predicting, "_answer", slowed(2, predicting._answer))
+    out = tmp_path / "p.safetensors"
+    asked = PredictRequest(checkpoint=run, data=data, out=out, device="cpu", batch=2)
+    count, seconds = predicting.predict(asked)
+    assert (count, seconds) == (5, pytest.approx(3 * 2 / 5))  # three batches
+    assert read_prediction_header(out).budget["seconds_per_cloud"] == pytest.approx(1.2)
 
 
 def test_icp_with_and_without_its_oracle(data: Path, tmp_path: Path) -> None:

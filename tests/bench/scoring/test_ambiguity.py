@@ -86,8 +86,9 @@ def test_the_turned_truth_is_right_where_it_looks_alike(name, exchanged, tmp_pat
         np.testing.assert_allclose(base, 180, atol=0.1)
     assert (base[even] > 90).all()
     for (metric, unit), values in on.items():
-        perfect = 1 if metric == "iou" else 0
-        np.testing.assert_allclose(values[even], perfect, atol=0.02, err_msg=f"{metric} {unit}")
+        perfect = {"iou": 1, "order": np.arange(values.shape[1])}.get(metric, 0)
+        expected = np.broadcast_to(perfect, values[even].shape)
+        np.testing.assert_allclose(values[even], expected, atol=0.02, err_msg=f"{metric} {unit}")
         np.testing.assert_array_equal(values[~even], off[metric, unit][~even])
     assert plain["variant"] == ""
     assert report["variant"] == "[ambiguity=on]"

@@ -43,8 +43,9 @@ def test_the_truth_scores_one_and_zero(split, tmp_path):
         errors, report = score(split, made.truth_as_prediction(split), tmp_path,
                                supervision=supervision)  # fmt: skip
         for (name, unit), value in errors.items():
-            expected = 1 if name == "iou" else 0
-            np.testing.assert_allclose(value, expected, atol=1e-6, err_msg=f"{name} {unit}")
+            expected = {"iou": 1, "order": np.arange(value.shape[1])}.get(name, 0)
+            np.testing.assert_allclose(value, np.broadcast_to(expected, value.shape), atol=1e-6,
+                                       err_msg=f"{name} {unit}")  # fmt: skip
         assert report["counts"]["samples"] == 11
         assert all(row["undefined"] == 0 for row in report["summary"].values())
         precision = report["average_precision"]
@@ -143,7 +144,7 @@ def test_the_csv_is_what_the_contract_says_and_the_same_bytes_twice(laptop, tmp_
     text = gzip.decompress(contents[0]).decode()
     assert text.splitlines()[0] == ",".join(COLUMNS)
     frame = pd.read_csv(tmp_path / "a" / "s.csv.gz")
-    assert len(frame) == 11 * (2 + 1 + 2 + 1 + 2 + 4)
+    assert len(frame) == 11 * (2 + 1 + 2 + 1 + 2 + 4 + 2)
     assert set(frame["unit"].astype(str)) == {"1", "deg", "r4", "m"}
     report = json.loads((tmp_path / "a" / "s.json").read_text())
     rows = frame[(frame["metric"] == "part_translation") & (frame["unit"] == "m")]
@@ -196,7 +197,7 @@ def test_labels_alone_leave_the_rest_empty(laptop, tmp_path):
     errors, report = score(laptop, arrays, tmp_path)
     np.testing.assert_array_equal(errors["iou", "1"], 1)
     for (name, _), value in errors.items():
-        assert name == "iou" or np.isnan(value).all()
+        assert name in ("iou", "order") or np.isnan(value).all()
     assert report["summary"]["part_rotation_deg"]["mean"] is None
     assert report["average_precision"]["part_15"] == {"k": 0, "n": 11, "low": 0.0, "high": 0.0}
 

@@ -19,8 +19,13 @@ def test_series_and_kinds(tmp_path):
     (path,) = tmp_path.glob("*.csv.gz")
     (scores,) = read_scores(path)
     assert series_of(scores) == Series("scapo", "cpu", "iou=soft,label-order=dataset")
-    assert [kind_of(name) for name in ("clean@1", "sim-art/1/sensor@2", "op-align-real@3", "x@4")
-            ] == ["clean", "sensor", "sensor", "clean"]  # fmt: skip
+    kinds = {
+        "clean@1": "clean", "sim-art/1/sensor@2": "sensor", "op-align-real@3": "sensor",
+        "x@4": "clean", "complete@5": "complete", "sim-art/2/complete@6": "complete",
+        "real@7": "real", "isolated@8": "isolated", "my-isolated@9": "isolated",
+        "surreal@10": "clean",
+    }  # fmt: skip
+    assert {name: kind_of(name) for name in kinds} == kinds
     assert scores.instance[:9].tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 0]
 
 

@@ -13,9 +13,10 @@ from torch.testing import assert_close
 from scapo.categories import CATEGORIES
 from scapo.geometry.points import squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
-from scapo.method import Step
+from scapo.method import Mode, Step
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.method import RegisteredConfig, RegisteredScapo, cpu_config
+from scapo.registered.view_bank import ShownPoints
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
@@ -36,6 +37,7 @@ def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
     method.template.load_state_dict(template().state_dict())
     camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
     method.pseudo.set(cloud[:, 0], truth, camera, torch.ones(12))
+    method.pseudo.show(ShownPoints.of(views))
     method.pseudo.belonging = torch.ones(cloud.shape[:2], dtype=torch.bool)
     observation = Observation(points=cloud)
     optimiser = torch.optim.Adam(method.network.parameters(), 3e-3)
@@ -88,6 +90,36 @@ def test_refinement_brings_the_template_closer():
     assert torch.allclose(refined.part_weight.sum(-1), torch.tensor(1.0), atol=1e-4)
 
 
+def test_quick_and_refine_find_the_poses_whatever_the_network_says():
+    method, observation = trained(0)
+    views, truth = sighted(6, seed=61)
+    unseen = Observation(points=views.points - views.camera[:, None])
+    bounds: tuple[tuple[Mode, float], ...] = (("quick", 8), ("refine", 6))
+    for mode, apart in bounds:
+        found = method.predict(unseen, mode)
+        assert found.camera_T_part is not None
+        errors = rotation_angle(found.camera_T_part[:, 0, :3, :3], truth.rotation).rad2deg()
+        assert errors.median() < apart
+        assert torch.allclose(found.part_weight.sum(-1), torch.tensor(1.0), atol=1e-4)
+        single = method.predict(Observation(points=unseen.points[3:4]), mode)
+        assert single.camera_T_part is not None
+        assert_close(single.camera_T_part[0], found.camera_T_part[3], atol=1e-3, rtol=1e-3)
+    assert len(observation.points) == 12
+
+
+def test_what_is_drawn_once_follows_the_template():
+    method, observation = trained(0)
+    before = method.predict(observation, "quick").canonical_points
+    with torch.no_grad():
+        method.template.points.mul_(1.3)
+    drawn = method._space()[0].rendered.radius
+    with torch.no_grad():
+        method.template.points.mul_(1 / 1.3)
+    ratio = drawn / method._space()[0].rendered.radius
+    assert 1.2 < ratio.median() < 1.4
+    assert_close(method.predict(observation, "quick").canonical_points, before)
+
+
 def test_the_first_weights_come_from_the_seed_alone():
     one, other = (
         RegisteredScapo(RegisteredConfig(), CATEGORIES["oven"], generator(4)) for _ in range(2)
@@ -110,12 +142,14 @@ def test_the_known_camera_moves_with_the_cloud():
     moved = Observation(
         points=observation.points @ turn.T + move, sensor=move.expand(len(observation.points), 3)
     )
-    plain, turned = (method.predict(seen, "refine") for seen in (observation, moved))
-    assert plain.camera_T_part is not None
-    assert turned.camera_T_part is not None
-    expected = turn @ plain.camera_T_part[:, 0, :3, :3]
-    angles = rotation_angle(turned.camera_T_part[:, 0, :3, :3], expected).rad2deg()
-    assert angles.median() < 1
+    modes: tuple[Mode, ...] = ("quick", "refine")
+    for mode in modes:
+        plain, turned = (method.predict(seen, mode) for seen in (observation, moved))
+        assert plain.camera_T_part is not None
+        assert turned.camera_T_part is not None
+        expected = turn @ plain.camera_T_part[:, 0, :3, :3]
+        angles = rotation_angle(turned.camera_T_part[:, 0, :3, :3], expected).rad2deg()
+        assert angles.median() < 1
 
 
 def test_pictures_show_the_template_on_the_clouds():

@@ -9,26 +9,28 @@ import torch
 
 from scapo.geometry.rigid import rotation_angle
 from scapo.registered.joint_limits import OUTSIDE_COST, JointLimits
-from scapo.registered.pairwise import rotation_grid
 from scapo.registered.pose_search import (
+    THOROUGH,
     SearchResult,
     SearchSpace,
     best_of,
     combinations,
+    modes_of,
     rank_by_confidence,
     refine_states,
     search,
 )
 from scapo.registered.template import Placement
+from scapo.registered.view_bank import ViewBank
 from tests.helpers.sighted import sighted, template
 
 
 def test_known_placements_are_found():
     views, truth = sighted(4, seed=40)
-    space = SearchSpace(
-        states=torch.linspace(0, 1, 4)[None], rotations=rotation_grid(700), cameras=None, keep=8
-    )
-    hypotheses = search(template(), views, space)
+    states = torch.linspace(0, 1, 4)[None]
+    bank = ViewBank.rendered(template(), modes_of(truth, states), None)
+    space = SearchSpace(rendered=bank, placed=None, states=states)
+    hypotheses = search(template(), views, space, replace(THOROUGH, proposed=8))
     free = JointLimits(low=torch.tensor([-9.0]), high=torch.tensor([9.0]), unit=torch.ones(1))
     found = hypotheses.best(free)
     errors = rotation_angle(found.placement.rotation, truth.rotation).rad2deg()
@@ -60,9 +62,14 @@ def test_the_best_and_its_margin():
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     rotation = torch.stack([torch.eye(3), turn, torch.eye(3), turn, turn, torch.eye(3)])
     start = Placement.at(rotation, torch.zeros(6, 3), torch.arange(6.0)[:, None])
-    found = best_of(start, torch.tensor([0.3, 0.2, 0.5, 0.1, 0.15, 0.4]), 2)
+    loss = torch.tensor([[0.3, 0.2, 0.5], [0.1, 0.15, 0.4]])
+    found = best_of(start, loss, torch.zeros(2, 3))
     assert found.placement.state[:, 0].tolist() == [1, 3]
     assert torch.allclose(found.margin, torch.tensor([0.1, 0.3]))
+    odd = best_of(start, loss, torch.tensor([[0.0, 0.4, 0.0], [0.0, 0.0, 0.0]]))
+    assert odd.placement.state[:, 0].tolist() == [0, 3]
+    assert torch.allclose(odd.loss, torch.tensor([0.3, 0.1]))
+    assert torch.allclose(odd.margin, torch.tensor([0.3, 0.3]))
 
 
 def test_views_are_ordered_by_confidence():
