@@ -119,8 +119,10 @@ def import_set(
             raise ValueError(line)
         result.refused[name] = line.removeprefix(f"{name}: ")
 
-    if (path.resolve() if path.is_dir() else path.resolve().parent) == out.resolve():
-        raise ValueError(f"{out}: expected a folder outside the source, found the source itself")
+    target = out.resolve()
+    within = (target, *target.parents) if path.is_dir() else (target / path.name,)
+    if path.exists() and path.resolve() in within:
+        raise ValueError(f"{out}: expected a folder outside the source, found it in {path}")
     reading = reading or Reading()
     with Pool[Any, Any](reading.workers, timeout=reading.timeout) as pool:
         calls = pool, refuse, reading.progress
