@@ -9,11 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.geometry.points import Similarity, gather, k_nearest, nearest
+from scapo.geometry.points import Similarity, k_nearest
 from scapo.geometry.rigid import rigid
 from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
-from scapo.registered.view_loss import oriented_nearest
-from scapo.registered.views import PartialViews, surface_normals
+from scapo.registered.views import surface_normals
 from scapo.types import Joints, Prediction
 
 NEIGHBOURS = 12  # Template points that tell the part of an observed one
@@ -101,34 +100,6 @@ def nearest_weights(
     return torch.stack(
         [smoothed(one, other, weight) for one, other in zip(source, target, strict=True)]
     )
-
-
-@torch.no_grad()
-def soft_parts(template: ArticulatedTemplate) -> Float[Tensor, "M P"]:
-    """Part weights of the template's points, each the mean over its neighbours (`smoothed`)."""
-    feature = oriented(template.points, template.normals)
-    return smoothed(feature, feature, template.logit.softmax(-1))
-
-
-@torch.no_grad()
-def coarse_weights(
-    template: ArticulatedTemplate,
-    points: Float[Tensor, "B N 3"],
-    placement: Placement,
-    views: PartialViews,
-    soft: Float[Tensor, "M P"],
-) -> Float[Tensor, "B N P"]:
-    """As `nearest_weights`, of one template point each, with normals of the views' points.
-
-    Args:
-        template: The category's.
-        points: In the views' frames.
-        placement: Of the views.
-        views: Their points lend the normals of those nearest to them.
-        soft: Part weights of the template's points (`soft_parts`).
-    """
-    normals = gather(views.normals, nearest(points, views.points))
-    return soft[oriented_nearest(points, normals, *template.place(placement))]
 
 
 def smoothed(

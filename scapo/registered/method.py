@@ -33,7 +33,7 @@ from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import DiscoveryConfig, TemplateConfig
-from scapo.registered.decode import coarse_weights, nearest_weights, placed_prediction, soft_parts
+from scapo.registered.decode import nearest_weights, placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
@@ -161,9 +161,7 @@ class AbstractRegistered(AbstractMethod):
                 for parameter in layer.parameters():
                     nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.pseudo = PseudoLabels()
-        self._drawn: (
-            tuple[list[tuple[int, int, torch.device]], tuple[SearchSpace, Tensor]] | None
-        ) = None
+        self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None
 
     @property
     def variant(self) -> str:
@@ -353,11 +351,7 @@ class AbstractRegistered(AbstractMethod):
         turned = (frame @ camera[..., None])[..., 0]
         views = observe(clean @ frame.mT, turned, index=index)
         chosen, confidence = self._searched(views, mode)
-        points = points @ frame.mT
-        if mode == "quick":
-            weight = coarse_weights(self.template, points, chosen, views, self._space()[1])
-        else:
-            weight = nearest_weights(self.template, points, chosen, turned)
+        weight = nearest_weights(self.template, points @ frame.mT, chosen, turned)
         chosen = turn_placement(chosen, frame.mT)
         return self._prediction(chosen, weight, similarity, confidence)
 
@@ -385,7 +379,7 @@ class AbstractRegistered(AbstractMethod):
         All happens in a frame of the cloud's own, so that grids of rolls and of the depth image
         turn with it.
         """
-        space, quick = self._space()[0], mode == "quick"
+        space, quick = self._space(), mode == "quick"
         effort = BRIEF if quick else THOROUGH
         count = self.config.quick_hypotheses if quick else self.config.grid_hypotheses
         start = space.propose(views, count) if count else self._hypotheses(views.points)[0]
@@ -402,15 +396,15 @@ class AbstractRegistered(AbstractMethod):
         """Of the training views that the network learned."""
         return limits_of(self.pseudo.state[self.pseudo.trust > 0], self.template.kinds)
 
-    def _space(self) -> tuple[SearchSpace, Float[Tensor, "M P"]]:
+    def _space(self) -> SearchSpace:
         """States, shifts, sizes and cameras of the training views that the network learned.
 
-        What is seen of the template from there is drawn once; with it come its `soft_parts`.
+        What is seen of the template from there is drawn once.
         """
         shape = [*self.template.state_dict(keep_vars=True).values(), *self.pseudo.buffers()]
         key = [(id(tensor), tensor._version, tensor.device) for tensor in shape]
         if self._drawn is None or self._drawn[0] != key:
-            self._drawn = key, (self._draw(), soft_parts(self.template))
+            self._drawn = key, self._draw()
         return self._drawn[1]
 
     def _draw(self) -> SearchSpace:

@@ -31,7 +31,7 @@ STATES_OF_ONE, STATES_OF_EACH = 7, 4
 """States of the grid where the category has one joint, and of each joint where it has more."""
 ROOM_SLIDING, ROOM = 0.1, 0.3
 """Share of the inliers' range beyond which states are searched: sliding joints, and hinges."""
-MODES = 32  # Placements of inliers whose states, shifts and sizes are looked for
+MODES = 16  # Placements of inliers whose states, shifts and sizes are looked for
 CHARGED = 0.1  # Share of the inliers' range beyond which a hypothesis is charged for its state
 RIVAL = 30.0  # Degrees from the best placement from which on another is its rival
 NO_RIVAL = 2.0  # Loss in place of a rival's where there is none: about the largest there is
@@ -48,8 +48,10 @@ class Effort:
     """Hypotheses, half of them by either bank."""
     rungs: tuple[tuple[StepOptions, int], ...]
     """Steps, and how many distinct hypotheses of a view go on."""
+    again: bool
+    """Whether those that are left then try all states again."""
     long: StepOptions
-    """Steps of those that are left, after their states were tried again."""
+    """Their steps after that."""
     last: StepOptions
     """Their last, against all points of the template: what ranks them should be sharp."""
 
@@ -60,12 +62,14 @@ THOROUGH = Effort(
         (StepOptions(steps=3, points=48, template_points=64), 12),
         (StepOptions(steps=5, points=96), 5),
     ),
+    again=True,
     long=StepOptions(steps=10, points=128),
     last=StepOptions(steps=4, points=256),
 )
 BRIEF = Effort(
     proposed=12,
     rungs=((StepOptions(steps=3, points=48, template_points=64), 3),),
+    again=False,
     long=StepOptions(steps=4, points=96, template_points=96),
     last=StepOptions(steps=2, points=192),
 )
@@ -282,7 +286,7 @@ def successive_halving(
 
     All are refined a little, the best distinct ones further, and fewer still to the end:
     right hypotheses are seldom the best before refinement, and few steps tell the hopeless ones.
-    Those that are left before the last steps try all states again.
+    Those that are left before the last steps may try all states again.
     """
     count, sparse = len(views.points), light(template)
     first = torch.arange(count, device=views.points.device)
@@ -296,7 +300,8 @@ def successive_halving(
         best = distinct(table, cost, min(left, number), RUNG_APART)
         placement = take(placement, (best + first[:, None] * number).flatten())
     repeated = take(views, first.repeat_interleave(len(placement.state) // count))
-    placement = _states_again(sparse, repeated, placement, space.states)
+    if effort.again:
+        placement = _states_again(sparse, repeated, placement, space.states)
     placement, _ = refine(sparse, repeated, placement, effort.long)
     placement, loss = refine(template, repeated, placement, effort.last)
     unlike = space.unlikeness(views, placement.rotation.unflatten(0, (count, -1)))

@@ -112,10 +112,10 @@ def test_what_is_drawn_once_follows_the_template():
     before = method.predict(observation, "quick").canonical_points
     with torch.no_grad():
         method.template.points.mul_(1.3)
-    drawn = method._space()[0].rendered.radius
+    drawn = method._space().rendered.radius
     with torch.no_grad():
         method.template.points.mul_(1 / 1.3)
-    ratio = drawn / method._space()[0].rendered.radius
+    ratio = drawn / method._space().rendered.radius
     assert 1.2 < ratio.median() < 1.4
     assert_close(method.predict(observation, "quick").canonical_points, before)
 
