@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from scapo.categories import CATEGORIES
 from scapo.predictor import load
 from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registry import LIBRARY
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.store.schema import StoreError
 from scapo.types import Observation
@@ -57,7 +58,8 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="nowhere: expected a run folder, a checkpoint or a cat"):
         load("nowhere")
     write_checkpoint(tmp_path / WEIGHTS, tiny(), checkpoint_header("other", TINY, "laptop", {}))
-    with pytest.raises(StoreError, match="expected a method of scapo, registered, found 'other'"):
+    known = ", ".join(LIBRARY)
+    with pytest.raises(StoreError, match=f"expected a method of {known}, found 'other'"):
         load(tmp_path)
 
 
