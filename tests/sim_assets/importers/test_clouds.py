@@ -63,10 +63,12 @@ def test_bad_real_files_are_named_with_the_reason(name: str, real: Record, tmp_p
     change, message = BAD_REAL[name]
     path = foreign.write_npz(change(real), tmp_path / "laptop_output/train/a/b/input_2/1.npz")
     with pytest.raises(ValueError, match=message) as caught:
-        import_set("op-align-real", tmp_path, tmp_path / "out", strict=True)
+        import_set(
+            "op-align-real", tmp_path, tmp_path.with_name(f"{tmp_path.name}-out"), strict=True
+        )
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path.with_name(f"{tmp_path.name}-out")).exists()
 
 
 BAD_LIGHT = {
@@ -94,6 +96,8 @@ def test_bad_light_files_are_named_with_the_reason(name: str, tmp_path: Path):
     record = change(foreign.light_record(view, np.eye(3), 0.42, (0, 1)))
     path = foreign.write_pt(record, tmp_path / "full/laptop_h/train/0.pt")
     with pytest.raises(ValueError, match=message) as caught:
-        import_set("op-align-light", tmp_path, tmp_path / "out", strict=True)
+        import_set(
+            "op-align-light", tmp_path, tmp_path.with_name(f"{tmp_path.name}-out"), strict=True
+        )
     assert str(caught.value).startswith(f"{path}: ")
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path.with_name(f"{tmp_path.name}-out")).exists()

@@ -75,8 +75,10 @@ def test_real(name: str, tmp_path: Path):
     place = f"{name}/test/hp_acn/60_box/input_2/1702990423.5.npz"
     record = foreign.real_record(view, turn)
     foreign.write_npz(record, tmp_path / "set" / place)
-    made = import_set("op-align-real", tmp_path / "set", tmp_path / "out", points=512)
-    folder = tmp_path / "out" / category / "test"
+    made = import_set(
+        "op-align-real", tmp_path / "set", tmp_path.with_name(f"{tmp_path.name}-out"), points=512
+    )
+    folder = tmp_path.with_name(f"{tmp_path.name}-out") / category / "test"
     assert made.written == [folder]
     assert (made.samples, made.refused) == (1, {})
     sample = assert_is(view, folder, "test", 512)
@@ -105,8 +107,8 @@ def test_real_keeps_every_point_of_the_detection(tmp_path: Path):
     record = foreign.real_record(view, QUARTER)
     kept = int((record["detection"] & record["pc"].any(1)).sum())
     foreign.write_npz(record, tmp_path / "laptop_output/train/a/b/input_2/1.npz")
-    import_set("op-align-real", tmp_path, tmp_path / "out", points=kept)
-    found = open_split(tmp_path / "out").arrays("points", "part")
+    import_set("op-align-real", tmp_path, tmp_path.with_name(f"{tmp_path.name}-out"), points=kept)
+    found = open_split(tmp_path.with_name(f"{tmp_path.name}-out")).arrays("points", "part")
     assert (found["part"] == 255).sum() == 2
     pc = record["pc"][record["detection"] & record["pc"].any(1)]
     np.testing.assert_allclose(found["points"][0], 0.1 * pc @ foreign.FLIP, atol=1e-6)
@@ -140,8 +142,10 @@ def test_light(name: str, tmp_path: Path):
     order = ORDERS[len(obj.visuals)]
     record = foreign.light_record(view, turn, diagonal, order)
     foreign.write_pt(record, tmp_path / f"pc/partial/{name}/train/203.pt")
-    made = import_set("op-align-light", tmp_path / "pc", tmp_path / "out", points=1536)
-    assert made.written == [tmp_path / "out" / category / "train"]
+    made = import_set(
+        "op-align-light", tmp_path / "pc", tmp_path.with_name(f"{tmp_path.name}-out"), points=1536
+    )
+    assert made.written == [tmp_path.with_name(f"{tmp_path.name}-out") / category / "train"]
     shift = np.eye(4)
     shift[:3, 3] = -centre
     moved = View(
@@ -151,7 +155,7 @@ def test_light(name: str, tmp_path: Path):
         pivot=view.pivot - centre,
         axis=view.axis,
     )
-    sample = assert_is(moved, tmp_path / "out", "train", 1536)
+    sample = assert_is(moved, tmp_path.with_name(f"{tmp_path.name}-out"), "train", 1536)
     np.testing.assert_allclose(sample["points"], moved.points, atol=1e-6)
     np.testing.assert_array_equal(sample["part"], view.part)
     assert np.isnan(sample["visible"]).all()
@@ -159,11 +163,11 @@ def test_light(name: str, tmp_path: Path):
         assert np.isnan(sample["joint_state"]).all()
     else:
         np.testing.assert_allclose(sample["joint_state"], state, atol=1e-5)
-    (folder,) = find_splits(tmp_path / "out")
+    (folder,) = find_splits(tmp_path.with_name(f"{tmp_path.name}-out"))
     described = describe_split(Split(folder))
     assert described.whole
     assert re.search(r"^  \S.* visible +unknown$", described.text, re.MULTILINE)
-    (instance,) = open_split(tmp_path / "out").manifest.instances
+    (instance,) = open_split(tmp_path.with_name(f"{tmp_path.name}-out")).manifest.instances
     assert instance.id == f"{name}-train-002"
     assert instance.source == f"partial/{name}/train"
 
@@ -174,8 +178,10 @@ def test_light_axes_are_turned_so_that_states_are_positive(tmp_path: Path):
     record = foreign.light_record(view, np.eye(3), 1.0, (0, 1))
     record["part_axis"] = -record["part_axis"]
     foreign.write_pt(record, tmp_path / "full/oven/train/0.pt")
-    import_set("op-align-light", tmp_path, tmp_path / "out", points=64)
-    found = open_split(tmp_path / "out").arrays("joint_axis", "joint_state", "visible")
+    import_set("op-align-light", tmp_path, tmp_path.with_name(f"{tmp_path.name}-out"), points=64)
+    found = open_split(tmp_path.with_name(f"{tmp_path.name}-out")).arrays(
+        "joint_axis", "joint_state", "visible"
+    )
     np.testing.assert_allclose(found["joint_axis"][0], view.axis, atol=1e-5)
     np.testing.assert_allclose(found["joint_state"][0], 0.6 * obj.upper, atol=1e-5)
     np.testing.assert_array_equal(found["visible"], 1)
@@ -209,13 +215,13 @@ def test_points_depend_on_the_files_name_alone(tmp_path: Path):
     """The same set elsewhere gives the same bytes, and a sample does not change with the others."""
     for place in ("a", "b/c"):
         light_set(tmp_path / place, {"full/laptop_h/train": 3})
-        import_set("op-align-light", tmp_path / place, tmp_path / place / "out", points=16)
-    folders = [tmp_path / place / "out/laptop/train" for place in ("a", "b/c")]
+        import_set("op-align-light", tmp_path / place, tmp_path / "out" / place, points=16)
+    folders = [tmp_path / "out" / place / "laptop/train" for place in ("a", "b/c")]
     assert shard_bytes(folders[0]) == shard_bytes(folders[1])
     before = open_split(folders[0]).arrays("points")["points"]
     assert np.abs(before[0] - before[1]).max() > 1e-3  # the same cloud, drawn anew
     (tmp_path / "a/full/laptop_h/train/99.pt").unlink()
-    import_set("op-align-light", tmp_path / "a/full", tmp_path / "a/out", points=16)
+    import_set("op-align-light", tmp_path / "a/full", tmp_path / "out/a", points=16)
     after = open_split(folders[0]).arrays("points")["points"]
     np.testing.assert_array_equal(after, before[1:])
     assert sorted(path.name for path in folders[0].parent.iterdir()) == ["train"]
@@ -223,9 +229,11 @@ def test_points_depend_on_the_files_name_alone(tmp_path: Path):
 
 def test_more_than_a_shard_and_too_few_points(tmp_path: Path):
     light_set(tmp_path, {"full/laptop_h/train": 70})
-    made = import_set("op-align-light", tmp_path, tmp_path / "out", points=200)
+    made = import_set(
+        "op-align-light", tmp_path, tmp_path.with_name(f"{tmp_path.name}-out"), points=200
+    )
     assert made.samples == 70
-    split = open_split(tmp_path / "out")
+    split = open_split(tmp_path.with_name(f"{tmp_path.name}-out"))
     assert [shard.count for shard in split.manifest.shards] == [64, 6]
     split.verify()
     points = split.arrays("points")["points"][69]
@@ -233,11 +241,12 @@ def test_more_than_a_shard_and_too_few_points(tmp_path: Path):
 
 
 def test_other_data_are_never_replaced(tmp_path: Path):
+    out = tmp_path / "out"
     light_set(tmp_path / "set", {"full/laptop_h/train": 1})
-    place = tmp_path / "out/laptop/train"
+    place = out / "laptop/train"
     place.mkdir(parents=True)
-    import_set("op-align-light", tmp_path / "set", tmp_path / "out", points=8)
+    import_set("op-align-light", tmp_path / "set", out, points=8)
     (place / "manifest.json").write_text("{}")
     with pytest.raises(ValueError, match="expected nothing, or data from op-align-light"):
-        import_set("op-align-light", tmp_path / "set", tmp_path / "out", points=8)
+        import_set("op-align-light", tmp_path / "set", out, points=8)
     assert (place / "manifest.json").read_text() == "{}"
