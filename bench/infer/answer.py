@@ -223,12 +223,17 @@ def _near_parts(
 
 
 def _limits(parts: Parts, model: Model) -> tuple[Float[np.ndarray, "J 2"], tuple[str, ...]]:
-    """Limits that hold the state: of training's objects, or of the category."""
+    """Limits that hold the state: of the category, or of training's objects by the method's zero.
+
+    Where neither is known, half of the category's travel either way.
+    """
     words = []
-    limits = parts.limits
-    if limits is None:
-        limits = np.array([[spec.lower, spec.upper] for spec in model.category.joints])
-        words.append("joint limits are those of the category: the method knows none")
+    limits = np.array([[spec.lower, spec.upper] for spec in model.category.joints])
+    if not model.is_aligned and parts.limits is not None:
+        limits = parts.limits
+    elif not model.is_aligned:
+        limits = limits - limits.mean(1, keepdims=True) + parts.state[:, None]
+        words.append("joint limits are a guess: the method knows neither rest nor range")
     wide = np.stack(
         [np.minimum(limits[:, 0], parts.state), np.maximum(limits[:, 1], parts.state)], -1
     )

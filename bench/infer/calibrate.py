@@ -107,7 +107,7 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
     written = [calibration_file(file, request.mode)]
     write_calibration(written[0], found)
     if request.picture is not None:
-        from bench.figures.reliability import reliability_picture
+        from bench.infer.diagram import reliability_picture
 
         reliability_picture(found.reliability, request.picture, f"{model.name}, {request.mode}")
         written.append(request.picture)
@@ -229,6 +229,6 @@ def _fitted(
             out = fold == one
             if out.any() and not out.all():
                 other = fit_map(x[~out], right[~out, index])
-                told[out] = [other.probability(row) for row in x[out]]
+                told[out] = [other.probability(row) for row in x[out].tolist()]
         probabilities.append(told)
     return tuple(maps), reliability(np.concatenate(probabilities), right.T.ravel())

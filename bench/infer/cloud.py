@@ -19,6 +19,8 @@ KEPT_POINTS = 200_000
 """That results are written for; of more, so many are drawn."""
 LARGEST = 30.0
 """Metres: no object of any category extends so far, in millimetres every one does."""
+FAR = 1e7
+"""Coordinates beyond it, in any unit, stand for nothing seen."""
 SPAN = (0.01, 0.99)
 """Quantiles of coordinates that count as the ends of a cloud."""
 
@@ -77,7 +79,7 @@ def made_fit(
     Raises:
         InputError: Too few points are left, or they are no object's in metres.
     """
-    known = np.isfinite(points).all(1) & points.any(1)
+    known = (np.abs(points) < FAR).all(1) & points.any(1)  # NaN is not less than anything
     index, warnings = np.flatnonzero(known), []
     if lost := len(points) - len(index):
         warnings.append(f"{lost:,} of {len(points):,} points left out: not finite, or at 0 0 0")

@@ -123,14 +123,13 @@ def answer(name: str, cloud: Cloud, models: Sequence[Model], mode: Mode, given: 
         words = f"the category is doubtful: {rival} explains the view almost as well; --category"
         twin = replace(twin, warnings=(*twin.warnings, words))
     twin, reason = with_confidence(twin, models[best].calibration)
-    method = models[best].predictor.model
     away = cloud.sensor is not None and bool(cloud.sensor.any())
     return Result(
         twin=twin,
         choice=choice,
         mode=mode,
         uncalibrated=reason,
-        aligned=models[best].calibration is not None or bool(method.supervision),
+        aligned=models[best].is_aligned,
         frame="input" if away else "camera",
     )
 

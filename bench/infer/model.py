@@ -31,6 +31,11 @@ class Model:
     calibration: Calibration | None
     """Of one mode; None: it was not calibrated for that."""
 
+    @property
+    def is_aligned(self) -> bool:
+        """Whether its frames, order of parts and states are the category's."""
+        return self.calibration is not None or bool(self.predictor.model.supervision)
+
     def alignment(self) -> Alignment:
         """From its own conventions to the category's."""
         if self.calibration is None:
@@ -55,7 +60,7 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
     digest = sha256_file(file)
     beside = None if mode is None else calibration_file(file, mode)
     return Model(
-        name=file.stem if file.name != WEIGHTS else path.resolve().name,
+        name=file.resolve().parent.name if file.name == WEIGHTS else file.stem,
         predictor=Predictor(method, device),
         category=CATEGORIES[header["category"]],
         method=header["method"],

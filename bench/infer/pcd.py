@@ -198,10 +198,8 @@ def unpacked(data: bytes, size: int, where: str) -> bytearray:
             start, length = len(out) - back, length + 2
             if start < 0:
                 raise IndexError
-            piece = out[start : start + length]
-            while len(piece) < length:  # a copy that runs into itself repeats
-                piece += piece
-            out += piece[:length]
+            piece = bytes(out[start : start + length])
+            out += (piece * (length // len(piece) + 1))[:length]  # into itself: it repeats
     except IndexError:
         raise InputError(f"{where}: expected packed points, found a broken stream") from None
     if len(out) != size:

@@ -5,42 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from bench.figures.drawing import LINE, save
+from bench.infer.calibration import Reliability
 from scapo.drawing import BACKGROUND, PART_COLORS
 
 TITLES = {"joint": "axis within 5 degrees", "part": "rotation within 10 degrees"}
 
 
-class Binned(Protocol):
-    """Answers by equal bins of probability (`bench.infer.calibration.Reliability`)."""
-
-    @property
-    def count(self) -> tuple[int, ...]:
-        """Answers in each bin."""
-        ...
-
-    @property
-    def predicted(self) -> tuple[float, ...]:
-        """Mean probability."""
-        ...
-
-    @property
-    def right(self) -> tuple[float, ...]:
-        """Share that was right."""
-        ...
-
-    @property
-    def error(self) -> float:
-        """Expected calibration error."""
-        ...
-
-
-def reliability_picture(kinds: Mapping[str, Binned], out: Path, title: str) -> None:
+def reliability_picture(kinds: Mapping[str, Reliability], out: Path, title: str) -> None:
     """One diagram a kind, the diagonal what perfect confidences would give, as a PNG file.
 
     Args:
@@ -69,5 +45,6 @@ def reliability_picture(kinds: Mapping[str, Binned], out: Path, title: str) -> N
             ylabel="share that is right",
             title=f"{TITLES.get(kind, kind)}\n{count.sum()} answers, off by {one.error:.1%}",
         )  # fmt: skip
-        axes.legend(loc="upper left", frameon=False)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
     save(figure, out)
