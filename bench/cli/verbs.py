@@ -207,6 +207,17 @@ class Calibrate(requests.CalibrateRequest):
             say(console, f"Written: {path}")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demo(requests.DemoRequest):
+    """A local page where a file is dropped and what infer makes of it appears."""
+
+    def run(self, console: Console) -> None:
+        """Serve until Ctrl-C."""
+        from bench.infer.server import serve
+
+        serve(self, lambda line: say(console, line))
+
+
 VERBS: dict[str, Any] = {
     "train": Train[tuple[()]],
     "predict": Predict,
@@ -219,6 +230,7 @@ VERBS: dict[str, Any] = {
     "reference": Reference,
     "infer": Infer,
     "calibrate": Calibrate,
+    "demo": Demo,
 }
 """In the order of the help, where `train` stands without its methods."""
 
