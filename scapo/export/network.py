@@ -6,12 +6,10 @@ The batch may have any size. Extra `onnx` for files.
 
 from __future__ import annotations
 
-import io
 import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,9 +60,7 @@ def write_onnx(network: nn.Module, example: Tensor, outputs: Sequence[str], path
         )
     if made is None:
         raise RuntimeError(f"{path}: expected an ONNX program, found none")
-    buffer = io.BytesIO()
-    made.save(buffer)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, made.model_proto.SerializeToString())
 
 
 @contextmanager
