@@ -17,7 +17,7 @@ import trimesh
 from jaxtyping import Float, Int
 from manifold3d import Manifold
 from scipy.ndimage import binary_fill_holes, map_coordinates
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 MAX_FACES = 4000
 MAX_SAMPLES = 4000
@@ -69,7 +69,7 @@ def seen_samples(points: Float[np.ndarray, "N 3"], camera: Float[np.ndarray, " 3
     """
     thin = Samples(points=points, normals=points).thinned(MAX_SAMPLES).points
     count = min(NEIGHBOURS, len(thin))
-    around = thin[_nearest(cKDTree(thin), thin, count)[1]]
+    around = thin[_nearest(KDTree(thin), thin, count)[1]]
     around = around - around.mean(1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][..., 0]
     away = ((camera - thin) * normal).sum(-1, keepdims=True) < 0
@@ -81,7 +81,7 @@ def joined(model: Samples, seen: Samples) -> Samples:
     if not len(seen.points) or not len(model.points):
         return seen if len(seen.points) else model
     spacing = _spacing(model.points)
-    gap, index = _nearest(cKDTree(seen.points), model.points, 1)
+    gap, index = _nearest(KDTree(seen.points), model.points, 1)
     alike = (seen.normals[index[:, 0]] * model.normals).sum(-1) > 0.5
     kept = ~((gap[:, 0] < spacing) & alike)
     return Samples(
@@ -130,7 +130,7 @@ def _principal(
 
 
 def _nearest(
-    tree: cKDTree, points: Float[np.ndarray, "N 3"], count: int
+    tree: KDTree, points: Float[np.ndarray, "N 3"], count: int
 ) -> tuple[Float[np.ndarray, "N K"], Int[np.ndarray, "N K"]]:
     """Distances and indices, with a last axis for one neighbour too."""
     distance, index = tree.query(points, k=list(range(1, count + 1)))
@@ -139,7 +139,7 @@ def _nearest(
 
 def _spacing(points: Float[np.ndarray, "N 3"]) -> float:
     """How far samples are apart, m, greater than 0."""
-    distance = _nearest(cKDTree(points), points, min(4, len(points)))[0][:, -1]
+    distance = _nearest(KDTree(points), points, min(4, len(points)))[0][:, -1]
     least = LEAST_SPACING * float(np.linalg.norm(np.ptp(points, axis=0)))
     return max(float(np.quantile(distance, SPACING)), least, 1e-4)
 
@@ -147,7 +147,7 @@ def _spacing(points: Float[np.ndarray, "N 3"]) -> float:
 def _smoothed(samples: Samples, spacing: float) -> Samples:
     """Points moved along their normals onto the plane through neighbours that face alike."""
     points, normals = samples.points, samples.normals
-    distance, index = _nearest(cKDTree(points), points, min(NEIGHBOURS, len(points)))
+    distance, index = _nearest(KDTree(points), points, min(NEIGHBOURS, len(points)))
     off = ((points[index] - points[:, None]) * normals[:, None]).sum(-1)
     alike = ((normals[index] * normals[:, None]).sum(-1) > 0.7) & (np.abs(off) < spacing / 2)
     alike[:, 0] = True
@@ -159,7 +159,7 @@ def _smoothed(samples: Samples, spacing: float) -> Samples:
 def _densified(samples: Samples) -> Samples:
     """With the middles between neighbours on one flat piece of surface; none beyond its rim."""
     points, normals = samples.points, samples.normals
-    index = _nearest(cKDTree(points), points, min(7, len(points)))[1][:, 1:]
+    index = _nearest(KDTree(points), points, min(7, len(points)))[1][:, 1:]
     pairs = np.stack([np.repeat(np.arange(len(points)), index.shape[1]), index.ravel()], -1)
     a, b = np.unique(np.sort(pairs, axis=1), axis=0).T
     step = points[b] - points[a]
@@ -191,7 +191,7 @@ def _level_set(points: Float[np.ndarray, "N 3"], radius: float, cell: float) -> 
     values = _interpolated(depth, np.array(asked))
     known = dict(zip(asked, values.tolist(), strict=True))
     made = Manifold.level_set(lambda x, y, z: known[(x, y, z)], bounds, EDGE)
-    made = _without_dust(made.scale((cell,) * 3).translate(tuple(low.tolist())))
+    made = _without_dust(made.scale(cell).translate(tuple(low.tolist())))
     tolerance = 0.05 * cell
     simple = made.simplify(tolerance)
     while simple.num_tri() > MAX_FACES and tolerance < 0.5 * cell:
@@ -226,12 +226,12 @@ def _depth(points: Float[np.ndarray, "N 3"], radius: float, grid: Grid) -> np.nd
     """
     low, count, cell = grid
     nodes = low + cell * np.indices(tuple(count)).reshape(3, -1).T
-    tree = cKDTree(points)
+    tree = KDTree(points)
     gap, near = tree.query(nodes, distance_upper_bound=radius + 2 * cell)
     inside = np.asarray(binary_fill_holes((gap < radius).reshape(count))).ravel()
     rim = np.flatnonzero(~inside & (gap < radius + 1.8 * cell))
     at = points[near[rim]]
-    edge = cKDTree(at + (nodes[rim] - at) * (radius / gap[rim])[:, None])
+    edge = KDTree(at + (nodes[rim] - at) * (radius / gap[rim])[:, None])
     most = radius + 2 * cell
     depth = np.full(len(nodes), -cell)
     depth[inside] = np.minimum(edge.query(nodes[inside], distance_upper_bound=most)[0], most)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -236,7 +236,7 @@ def _limits(joint: Joint) -> dict[str, str]:
 def _add_link(robot: Element, link: Link, origin: Vector) -> None:
     node = SubElement(robot, "link", name=link.name)
     if link.surfaces or link.inertia is not None:
-        _add_inertial(node, _inertia(link), origin)
+        _add_inertial(node, _inertia(link, origin))
     for number, surface in enumerate(link.surfaces):
         visual = SubElement(node, "visual", name=f"{link.name}-{number}")
         _add_mesh(visual, _mesh_name(link, number))
@@ -254,21 +254,28 @@ def _add_mesh(node: Element, file: str) -> None:
     SubElement(geometry, "mesh", filename=file, scale="1 1 1")
 
 
-def _inertia(link: Link) -> Inertia:
-    """Its own, or that of its bounding box at a nominal density, at least 1 g and 1 cm."""
-    if link.inertia is not None:
-        return link.inertia
-    points = np.concatenate([surface.vertices for surface in link.surfaces])
+def box_inertia(points: Float[np.ndarray, "N 3"]) -> tuple[float, Vector, Vector]:
+    """Mass (kg), centre and principal moments (kg m2) of the box about points, along its sides.
+
+    At a nominal density; at least 1 g and 1 cm.
+    """
     size = np.maximum(np.ptp(points, axis=0), 0.01)
     mass = max(DENSITY * float(np.prod(size)), 1e-3)
-    moments = mass / 12 * (np.sum(size**2) - size**2)
-    centre = (points.min(0) + points.max(0)) / 2
+    return mass, (points.min(0) + points.max(0)) / 2, mass / 12 * (np.sum(size**2) - size**2)
+
+
+def _inertia(link: Link, origin: Vector) -> Inertia:
+    """In the link's own frame; where it has none, that of its bounding box."""
+    if link.inertia is not None:
+        return replace(link.inertia, centre=link.inertia.centre - origin)
+    points = np.concatenate([surface.vertices for surface in link.surfaces]) - origin
+    mass, centre, moments = box_inertia(points)
     return Inertia(mass=mass, centre=centre, moments=np.diag(moments))
 
 
-def _add_inertial(node: Element, body: Inertia, origin: Vector) -> None:
+def _add_inertial(node: Element, body: Inertia) -> None:
     inertial = SubElement(node, "inertial")
-    SubElement(inertial, "origin", xyz=_numbers(body.centre - origin), rpy="0 0 0")
+    SubElement(inertial, "origin", xyz=_numbers(body.centre), rpy="0 0 0")
     SubElement(inertial, "mass", value=_numbers([body.mass]))
     SubElement(inertial, "inertia", {name: _moment(body.moments[at]) for name, at in _MOMENTS})
 
