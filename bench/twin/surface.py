@@ -108,14 +108,16 @@ def closed_mesh(samples: Samples) -> trimesh.Trimesh:
     local = Samples(points=(few.points - centre) @ turn, normals=few.normals @ turn)
     spacing = _spacing(local.points)
     dense = _densified(_densified(_smoothed(local, spacing))).points
-    cell = spacing / FINE
+    wanted = spacing / FINE
     while True:
-        made = _level_set(dense, REACH * spacing, cell)
+        low, count, cell = _grid(dense, REACH * spacing, wanted)
+        made = _level_set(_depth(dense, REACH * spacing, (low, count, cell)))
         if made.num_tri() <= MAX_FACES:
             break
-        cell *= COARSER
+        wanted = COARSER * cell
     mesh = made.to_mesh64()
-    vertices = np.asarray(mesh.vert_properties, float)[:, :3] @ turn.T + centre
+    vertices = low + cell * np.asarray(mesh.vert_properties, float)[:, :3]
+    vertices = vertices @ turn.T + centre
     return trimesh.Trimesh(vertices, np.asarray(mesh.tri_verts, np.int64), process=False)
 
 
@@ -133,8 +135,8 @@ def _nearest(
     tree: KDTree, points: Float[np.ndarray, "N 3"], count: int
 ) -> tuple[Float[np.ndarray, "N K"], Int[np.ndarray, "N K"]]:
     """Distances and indices, with a last axis for one neighbour too."""
-    distance, index = tree.query(points, k=list(range(1, count + 1)))
-    return np.asarray(distance), np.asarray(index)
+    distance, index = tree.query(points, k=count)
+    return np.reshape(distance, (-1, count)), np.reshape(index, (-1, count))
 
 
 def _spacing(points: Float[np.ndarray, "N 3"]) -> float:
@@ -176,11 +178,9 @@ def _densified(samples: Samples) -> Samples:
     )
 
 
-def _level_set(points: Float[np.ndarray, "N 3"], radius: float, cell: float) -> Manifold:
-    """The solid that a ball of this radius leaves, pieces of dust apart, simplified."""
-    low, count, cell = _grid(points, radius, cell)
-    depth = _depth(points, radius, (low, count, cell))
-    bounds = [0.0, 0.0, 0.0, *(count - 1.0)]
+def _level_set(depth: Float[np.ndarray, "X Y Z"]) -> Manifold:
+    """Where the depth at the nodes is above 0, in cells; without dust, simplified."""
+    bounds = [0.0, 0.0, 0.0, *(np.array(depth.shape) - 1.0)]
     asked: list[tuple[float, float, float]] = []
 
     def note(x: float, y: float, z: float) -> float:
@@ -188,13 +188,12 @@ def _level_set(points: Float[np.ndarray, "N 3"], radius: float, cell: float) -> 
         return -1.0
 
     Manifold.level_set(note, bounds, EDGE)  # where it looks, to be answered all at once
-    values = _interpolated(depth, np.array(asked))
+    values = map_coordinates(depth, np.array(asked).T, order=1, mode="nearest")
     known = dict(zip(asked, values.tolist(), strict=True))
-    made = Manifold.level_set(lambda x, y, z: known[(x, y, z)], bounds, EDGE)
-    made = _without_dust(made.scale(cell).translate(tuple(low.tolist())))
-    tolerance = 0.05 * cell
+    made = _without_dust(Manifold.level_set(lambda x, y, z: known[(x, y, z)], bounds, EDGE))
+    tolerance = 0.05
     simple = made.simplify(tolerance)
-    while simple.num_tri() > MAX_FACES and tolerance < 0.5 * cell:
+    while simple.num_tri() > MAX_FACES and tolerance < 0.5:
         tolerance *= COARSER
         simple = made.simplify(tolerance)
     return _without_dust(simple)
@@ -227,7 +226,7 @@ def _depth(points: Float[np.ndarray, "N 3"], radius: float, grid: Grid) -> np.nd
     low, count, cell = grid
     nodes = low + cell * np.indices(tuple(count)).reshape(3, -1).T
     tree = KDTree(points)
-    gap, near = tree.query(nodes, distance_upper_bound=radius + 2 * cell)
+    gap, near = map(np.asarray, tree.query(nodes, distance_upper_bound=radius + 2 * cell))
     inside = np.asarray(binary_fill_holes((gap < radius).reshape(count))).ravel()
     rim = np.flatnonzero(~inside & (gap < radius + 1.8 * cell))
     at = points[near[rim]]
@@ -236,7 +235,3 @@ def _depth(points: Float[np.ndarray, "N 3"], radius: float, grid: Grid) -> np.nd
     depth = np.full(len(nodes), -cell)
     depth[inside] = np.minimum(edge.query(nodes[inside], distance_upper_bound=most)[0], most)
     return (depth - radius + THICK * cell).reshape(count)
-
-
-def _interpolated(values: np.ndarray, places: Float[np.ndarray, "N 3"]) -> np.ndarray:
-    return map_coordinates(values, places.T, order=1, mode="nearest")
