@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 from manifold3d import Manifold
-from scipy.ndimage import binary_fill_holes, map_coordinates
+from scipy.ndimage import binary_fill_holes, map_coordinates, maximum_filter
 from scipy.spatial import KDTree
 
 MAX_FACES = 4000
@@ -34,8 +34,8 @@ FINE = 3.5
 """Cells of the grid in a spacing."""
 NODES = 150_000
 """Of the grid at most, which is coarser where the part is large."""
-THICK = 0.8
-"""Half the least thickness, in cells."""
+THIN, SOLID = 0.8, 0.2
+"""Cells that are added on all sides: to what is thinner than a cell or so, and to the rest."""
 EDGE = 1.2
 """Edges of the level set's triangles, in cells."""
 COARSER = 1.4
@@ -218,7 +218,7 @@ def _grid(points: Float[np.ndarray, "N 3"], radius: float, cell: float) -> Grid:
 
 
 def _depth(points: Float[np.ndarray, "N 3"], radius: float, grid: Grid) -> np.ndarray:
-    """How deep each node lies in the solid, m; below 0 outside.
+    """How deep each node lies in the solid, in cells; below 0 outside.
 
     Within `radius` of the points is where the ball's centre cannot go; as far from that rim as
     the radius is where the ball does not reach. Cavities that are closed are filled.
@@ -234,4 +234,6 @@ def _depth(points: Float[np.ndarray, "N 3"], radius: float, grid: Grid) -> np.nd
     most = radius + 2 * cell
     depth = np.full(len(nodes), -cell)
     depth[inside] = np.minimum(edge.query(nodes[inside], distance_upper_bound=most)[0], most)
-    return (depth - radius + THICK * cell).reshape(count)
+    depth = (depth.reshape(count) - radius) / cell
+    solid = np.clip(maximum_filter(depth, 5) - 0.5, 0, 1)
+    return depth + THIN + (SOLID - THIN) * solid
