@@ -277,3 +277,75 @@ class GridRequest:
     """Write plan.json, show what it comes to, and stop."""
     replan: bool = False
     """Write plan.json anew where it differs; what is finished and still the same stays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelRequest:
+    """Which model answers, and how."""
+
+    checkpoint: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
+    """Run folder or checkpoint of the model."""
+    category: str | None = None
+    """Category whose released model answers. With neither, every released model is asked, and the
+    one whose shape explains the view best is taken."""
+    mode: Mode = "refine"
+    """fast: networks only; refine: with optimisation at test time; quick: with a little of it."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InferRequest(ModelRequest):
+    """Somebody's files, and what they do not say themselves."""
+
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="INPUT...")]
+    """Clouds (.ply, .pcd, .npz with points [, color, sensor]), depth images (.png, .tif) and
+    folders of these."""
+    out: Path
+    """Folder for the results, in OUT/NAME/ for each input NAME.ply."""
+    mask: Path | None = None
+    """Image that is not 0 where a depth image shows the object; else NAME.mask.png beside it, else
+    the nearest thing that is neither floor nor wall is taken."""
+    intrinsics: str | None = None
+    """Camera of a depth image: fx,fy,cx,cy in pixels, or a JSON or YAML file; else NAME.json,
+    NAME.yaml, intrinsics.json or intrinsics.yaml beside it."""
+    scale: float | None = None
+    """Metres in one unit of the input; by default 0.001 for images of whole numbers, else 1."""
+    sensor: tuple[float, float, float] | None = None
+    """Centre of the camera in metres, for clouds in another frame than the camera's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateRequest:
+    """A model, and the labelled clouds that it is compared with."""
+
+    checkpoint: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, checkpoint, or category with a released model."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    split: str = "val"
+    """Labelled split, which the model was not trained on and is not scored on."""
+    mode: Mode = "refine"
+    """Inference mode that is calibrated, each for itself."""
+    limit: int | None = 300
+    """Samples, evenly spread over the split, each asked six times."""
+    picture: Path | None = None
+    """Reliability diagram, FILE.png."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoRequest(ModelRequest):
+    """Where the page is served, and what it takes."""
+
+    port: int = 8000
+    """Port of the page."""
+    host: str = "127.0.0.1"
+    """Address that is listened at; 0.0.0.0 lets other machines in."""
+    max_upload: int = 64
+    """Megabytes of an upload."""
+    queue: int = 64
+    """Uploads that may wait; more are sent away."""
+    keep: int = 100
+    """Results that are kept."""

@@ -206,6 +206,51 @@ class Run(requests.GridRequest):
                                "failed; the same command tries them again")  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Infer(requests.InferRequest):
+    """Parts and joints of the object in somebody's cloud or depth image, with a moving twin."""
+
+    def run(self, console: Console) -> None:
+        """Answer each input, a line for each; fail at the end where any failed.
+
+        Raises:
+            ValueError: How many failed, or what was wrong with the only one.
+        """
+        from bench.infer.infer import Done, infer, summary
+
+        single = len(self.inputs) == 1 and not any(path.is_dir() for path in self.inputs)
+
+        def tell(done: Done) -> None:
+            if not (single and done.error):
+                say(Console(stderr=True) if done.error else console, summary(done))
+
+        done = infer(self, tell)
+        failed = [one for one in done if one.error]
+        if failed and single:
+            raise ValueError(failed[0].error)
+        if failed:
+            raise ValueError(f"expected {len(done)} answers, found {len(done) - len(failed)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrate(requests.CalibrateRequest):
+    """Learn from labelled clouds how far answers of infer are to be trusted, and which way is up.
+
+    Written beside the checkpoint, where infer finds it.
+    """
+
+    def run(self, console: Console) -> None:
+        """Ask, fit and write; say how often answers were right, and how true the confidences."""
+        from bench.infer.calibrate import calibrate
+
+        found, written = calibrate(self, watched(console, "calibrate"))
+        for kind, one in found.reliability.items():
+            off = f"confidences off by {100 * one.error:.1f} % on other objects"
+            say(console, f"{kind}: {100 * one.base_rate:.0f} % right; {off}")
+        for path in written:
+            say(console, f"Written: {path}")
+
+
 VERBS: dict[str, Any] = {
     "train": Train[tuple[()]],
     "predict": Predict,
@@ -217,6 +262,8 @@ VERBS: dict[str, Any] = {
     "study": Study,
     "reference": Reference,
     "run": Run,
+    "infer": Infer,
+    "calibrate": Calibrate,
 }
 """In the order of the help, where `train` stands without its methods."""
 
