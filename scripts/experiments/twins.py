@@ -46,7 +46,7 @@ from sim_assets.sampling.cloud import sample_surface
 
 SHAPE, DENSE, ASKED = 1600, 40_000, 2_000
 """Points of the stand-in for a template; of each surface for the Chamfer distance, and how many of
-them are asked for their nearest. Two draws from one surface differ by 0.2 to 0.4 % of a diagonal."""
+them are asked for their nearest."""
 SHARES = (0.05, 0.35, 0.65, 0.95)
 """Of the travel: the other states."""
 HINGE, PIVOT = 5.0, 0.05
@@ -297,7 +297,7 @@ def measure(category: str, found: list[Sample]) -> str:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("category", nargs="+")
     parser.add_argument("--split", default="val")
