@@ -245,6 +245,41 @@ class TrainRequest(Generic[M]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class GridRequest:
+    """Which grid is run, on what, and how."""
+
+    preset: tyro.conf.Positional[Literal["smoke", "cpu", "paper"]]
+    """smoke: three methods on a few ovens, under three minutes; cpu: every table with the lean
+    presets; paper: with the published sizes, for GPUs."""
+    out: Path
+    """Folder for plan.json, runs/, predictions/, scores/, tables/ and jobs/ (records and logs)."""
+    data: Path | None = None
+    """Folder of the data, PART/CATEGORY/SPLIT; by default OUT/data. What is missing is made by
+    scapo-data."""
+    only: tuple[str, ...] = ()
+    """Only these trainings: patterns of parts, categories, methods or seeds (clean, oven, scapo*,
+    seed1), or several joined by /, such as clean/registered."""
+    splits: tuple[str, ...] = ()
+    """Splits to score, such as val while a method is being made; by default test and test-ood."""
+    budget_minutes: float | None = None
+    """Time of each training on one core, which bounds its epochs; by default the preset's."""
+    real: Path | None = None
+    """Real models of yours, PATH/CATEGORY/ID/*.urdf, to be scored too."""
+    engine: Literal["local", "ray"] = "local"
+    """Where trainings run: on this machine, or on the Ray cluster of RAY_ADDRESS, whose machines
+    all see OUT under the same name."""
+    workers: int | None = None
+    """Trainings at a time; by default one per core, or one where there is a GPU."""
+    gpus: float = 0.0
+    """GPUs of each training: what Ray is asked for. From 2 on a training runs as so many processes
+    of torchrun."""
+    plan_only: bool = False
+    """Write plan.json, show what it comes to, and stop."""
+    replan: bool = False
+    """Write plan.json anew where it differs; what is finished and still the same stays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModelRequest:
     """Which model answers, and how."""
 

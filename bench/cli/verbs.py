@@ -15,7 +15,16 @@ import tyro
 from rich.console import Console
 
 from bench import requests
-from bench.cli.console import say, stability_tables, stage_bars, summary_table, watched
+from bench.cli.console import (
+    chain_line,
+    in_words,
+    say,
+    shown,
+    stability_tables,
+    stage_bars,
+    summary_table,
+    watched,
+)
 from bench.metrics import ApRule
 
 
@@ -81,6 +90,8 @@ class Tables:
     """Split of all tables but 6, which has test-ood beside it."""
     ap_rule: ApRule = "mean"
     """How the parts of a sample join in the average precision of Table 2."""
+    html: bool = False
+    """Also write index.html: the tables as a leaderboard that a browser opens from disk."""
     check_paper: bool = False
     """Only list what does not add up in the paper's printed tables; writes nothing."""
 
@@ -92,7 +103,7 @@ class Tables:
         lines = (
             check()
             if self.check_paper
-            else make_tables(self.scores, self.out, self.ap_rule, self.split)
+            else make_tables(self.scores, self.out, self.ap_rule, self.split, page=self.html)
         )
         for line in lines:
             say(console, line)
@@ -163,6 +174,39 @@ class Reference(requests.ReferenceRequest):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Run(requests.GridRequest):
+    """Run the benchmark: methods x categories x seeds, and the tables of their scores.
+
+    Goes on where it was interrupted or killed. Each command has its log in OUT/jobs; one that fails
+    costs what depends on it alone.
+    """
+
+    def run(self, console: Console) -> None:
+        """Show plan and estimate, do what is left, and name what failed."""
+        from bench.grid.run import Grid
+
+        grid = Grid(self)
+        plan, chains = grid.plan(lambda line: say(console, line))
+        status = grid.status(plan, chains)
+        say(console, f"{len(chains)} trainings, {len(status.estimate.left)} of "
+            f"{sum(len(one.steps) for one in plan.chains)} steps of the plan are left; these take "
+            f"{in_words(*status.seconds_left())} with {status.workers} at a time")  # fmt: skip
+        if self.plan_only:
+            return
+        with shown(console, status):
+            for name, ended in grid.go(plan, status):
+                console.print(chain_line(name, ended), soft_wrap=True)
+        failed = status.failed
+        for one in failed:
+            say(console, f"failed: {one.chain}: {one.reason}")
+        for path in grid.tables(plan):
+            say(console, path)
+        if failed:
+            raise RuntimeError(f"run: expected every step to end well, found {len(failed)} that "
+                               "failed; the same command tries them again")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Infer(requests.InferRequest):
     """Parts and joints of the object in somebody's cloud or depth image, with a moving twin."""
 
@@ -228,6 +272,7 @@ VERBS: dict[str, Any] = {
     "pictures": Pictures,
     "study": Study,
     "reference": Reference,
+    "run": Run,
     "infer": Infer,
     "calibrate": Calibrate,
     "demo": Demo,
