@@ -42,7 +42,7 @@ from werkzeug.exceptions import (
 from werkzeug.serving import WSGIRequestHandler, make_server
 from werkzeug.wrappers import Request, Response
 
-from bench.infer.files import JOINTS, PAGE, write_result
+from bench.infer.files import PAGE, write_result
 from bench.infer.infer import answer
 from bench.infer.model import Model, load_models
 from bench.infer.readers import SUFFIXES, ReadOptions, read_input
@@ -144,7 +144,7 @@ class Demo:
         finally:
             request.close()
         response.headers["X-Content-Type-Options"] = "nosniff"
-        response.headers["Referrer-Policy"] = "no-referrer"
+        response.headers["Referrer-Policy"] = "same-origin"  # none would make Origin null
         response.headers["Cache-Control"] = "no-store"
         return response(environ, start)
 
@@ -231,8 +231,7 @@ class Demo:
             finally:
                 if key not in self.results:
                     shutil.rmtree(folder, ignore_errors=True)
-        shown = PAGE if PAGE in self.results[key] else JOINTS
-        return Response(status=303, headers={"Location": f"/results/{key}/{shown}"})
+        return Response(status=303, headers={"Location": f"/results/{key}/{PAGE}"})
 
     @contextmanager
     def _place(self) -> Iterator[None]:

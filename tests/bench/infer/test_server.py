@@ -74,6 +74,7 @@ def test_a_dropped_file_gives_its_page_and_files(demo, cloud):
     answer = post(demo, cloud)
     assert answer.status_code == 303
     place = answer.headers["Location"]
+    assert place.endswith("/page.html")
     record = get(demo, place.replace("page.html", "joints.json"))
     assert record.content_type == "application/json"
     assert json.loads(record.data)["input"] == "box"
