@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from bench.matching import joint_order
 from scapo.categories import Category
+from scapo.geometry.part_order import joint_order
 from scapo.geometry.rigid import joint_motion
 
 

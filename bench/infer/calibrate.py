@@ -28,12 +28,13 @@ from bench.infer.calibration import (
 from bench.infer.cloud import Cloud
 from bench.infer.model import Model, load_model
 from bench.matching import calibrate as fit_frames
-from bench.matching import choose_order, confusion, rotation_degrees
+from bench.matching import choose_order, rotation_degrees
 from bench.metrics import line_degrees
 from bench.requests import CalibrateRequest
 from bench.runs.train import pick_device
 from bench.twin.record import BACKGROUND, Twin
 from scapo.categories import Category
+from scapo.geometry.part_order import confusion
 from scapo.method import evenly
 from scapo.predictor import find
 from scapo.store import Split, StoreError, open_split
