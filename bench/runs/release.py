@@ -42,6 +42,44 @@ LEGEND = (
 )
 CAMERA = """
 `quick` and `refine` use where the camera stands: the origin of the cloud's frame, or `sensor`."""
+CARD = """# {title}: {category}
+
+`scapo.load("{name}").predict(points)`: parts, poses and joints of one {category} in a
+point cloud, (N, 3), metres, camera frame (x right, y down, z forward).{camera}
+
+| | |
+|---|---|
+| method | `{method}`, {parameters:,} parameters, half precision |
+| trained on | data with digest `{data_digest}`, labels: {labels} |
+| seed, steps, commit | {seed}, {steps:,}, `{commit}` |
+| made by | `scapo-bench train {method}`, `scapo-bench release` |
+| licence | MIT, as the code; the data are procedural |
+
+## Scores
+
+{scores}
+
+## Intended use
+
+Research on articulated objects, and a start for robots that open and close things, with the object
+segmented from its surroundings. One object of the category, in the units of the camera.
+
+## Limits
+
+- Trained on procedural shapes: real objects look different (rows `real`, where there are any).
+- Views that several poses explain are answered by one of them; the scores say how often.
+- Without labels in training the frames of the parts are the method's own, up to one rigid offset
+  for each part (`scapo-bench calibrate` learns it from labelled clouds).
+- Nothing tells whether a cloud shows the category at all. No safety may rest on an answer.
+
+<details><summary>Configuration</summary>
+
+```json
+{config}
+```
+
+</details>
+"""
 METRICS = (
     ("S, %", "iou_1", 100.0, 1),
     ("D, deg", "joint_direction_deg", 1.0, 1),
@@ -157,50 +195,18 @@ def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[st
 def card_of(header: Header, request: ReleaseRequest) -> str:
     """The model's card, in Markdown."""
     entry = find(header["method"])
-    title = header["method"] if entry is None else entry.title
-    name = request.out.stem.replace("-", "/", 1)
-    labels = ", ".join(header["supervision"]) or "none"
-    kind = header["category"]
-    config = json.dumps(header["config"], indent=1, sort_keys=True)
-    camera = CAMERA if entry is not None and entry.camera else ""
-    return f"""# {title}: {header["category"]}
-
-`scapo.load("{name}").predict(points)`: parts, poses and joints of one {kind} in a
-point cloud, (N, 3), metres, camera frame (x right, y down, z forward).{camera}
-
-| | |
-|---|---|
-| method | `{header["method"]}`, {header.get("parameters", 0):,} parameters, half precision |
-| trained on | data with digest `{header["data_digest"]}`, labels: {labels} |
-| seed, steps, commit | {header["seed"]}, {header["steps"]:,}, `{header.get("commit", "")}` |
-| made by | `scapo-bench train {header["method"]}`, `scapo-bench release` |
-| licence | MIT, as the code; the data are procedural |
-
-## Scores
-
-{scores_table(header, request.scores)}
-
-## Intended use
-
-Research on articulated objects, and a start for robots that open and close things, with the object
-segmented from its surroundings. One object of the category, in the units of the camera.
-
-## Limits
-
-- Trained on procedural shapes: real objects look different (rows `real`, where there are any).
-- Views that several poses explain are answered by one of them; the scores say how often.
-- Without labels in training the frames of the parts are the method's own, up to one rigid offset
-  for each part (`scapo-bench calibrate` learns it from labelled clouds).
-- Nothing tells whether a cloud shows the category at all. No safety may rest on an answer.
-
-<details><summary>Configuration</summary>
-
-```json
-{config}
-```
-
-</details>
-"""
+    return CARD.format(
+        **{name: header.get(name, "") for name in ("method", "category", "data_digest", "seed")},
+        title=header["method"] if entry is None else entry.title,
+        name=request.out.stem.replace("-", "/", 1),
+        camera=CAMERA if entry is not None and entry.camera else "",
+        parameters=header.get("parameters", 0),
+        steps=header["steps"],
+        commit=header.get("commit", ""),
+        labels=", ".join(header["supervision"]) or "none",
+        scores=scores_table(header, request.scores),
+        config=json.dumps(header["config"], indent=1, sort_keys=True),
+    )
 
 
 def scores_table(header: Header, scores: Path | None) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def request(folder: Path, **more) -> ReleaseRequest:
+def request(folder: Path, **more: Path) -> ReleaseRequest:
     out = folder / "results" / "checkpoints" / "laptop-scapo.safetensors"
-    return ReleaseRequest(**{"checkpoint": folder / "run", "data": folder / "data", "out": out}
-                          | more)  # fmt: skip
+    asked = ReleaseRequest(checkpoint=folder / "run", data=folder / "data", out=out)
+    return dataclasses.replace(asked, **more)
 
 
 def test_a_release_is_half_as_large_and_answers_alike(folder: Path, monkeypatch):
