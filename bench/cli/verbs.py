@@ -262,6 +262,18 @@ class Demo(requests.DemoRequest):
         serve(self, lambda line: say(console, line))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Release(requests.ReleaseRequest):
+    """Make a small checkpoint of a finished run, with its card, for scapo.load and infer."""
+
+    def run(self, console: Console) -> None:
+        """Write them, and say how large the model is."""
+        from bench.runs.release import release
+
+        for path in release(self):
+            say(console, f"{path}: {path.stat().st_size:,} bytes")
+
+
 VERBS: dict[str, Any] = {
     "train": Train[tuple[()]],
     "predict": Predict,
@@ -273,6 +285,7 @@ VERBS: dict[str, Any] = {
     "study": Study,
     "reference": Reference,
     "run": Run,
+    "release": Release,
     "infer": Infer,
     "calibrate": Calibrate,
     "demo": Demo,

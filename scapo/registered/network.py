@@ -72,9 +72,7 @@ class PointVotes(nn.Module):
         """Votes for clouds of mean radius 0.25 in their principal frames."""
         return self.given(points, k_nearest(points, points, NEIGHBOURS))
 
-    def given(
-        self, points: Float[Tensor, "B K 3"], index: Int[Tensor, "B K {NEIGHBOURS}"]
-    ) -> Votes:
+    def given(self, points: Float[Tensor, "B K 3"], index: Int[Tensor, "B K N"]) -> Votes:
         """The same with the nearest points of each known."""
         near = gather(points, index.flatten(1)).unflatten(1, index.shape[1:])
         step = STEP_SCALE * (near - points[:, :, None])
