@@ -43,8 +43,9 @@ NEIGHBOUR, FLATNESS = 0.06, 3.0
 STIFFNESS = 10.0  # How far answers spread, against what each point says itself
 LEAST_COUNT, ALL_COUNT = 40, 6000
 """Points of a view that the template is built from, at least, and of all views together."""
-BASE_BONUS = 0.3
-"""Log support by which the base wins over a part: what nothing tells apart stays with it."""
+BASE_BONUS, LEAST_BONUS, LEAST_PART = 0.3, 0.1, 0.05
+"""Log support by which the base wins over a part, so that what nothing tells apart stays with it;
+that where it would leave a part with less than this share of the points."""
 SUPPORTED = 0.4  # Share of the views that must agree for a point to enter the template
 SEEN = 0.05  # Share of the observers that must have seen it, or more than one view
 LEAST_GOOD = 50  # Points without which the template stays as it was
@@ -164,8 +165,7 @@ def rebuild(
         observers=order[:OBSERVERS],
     )
     score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
-    score[..., 0] += BASE_BONUS
-    score = smooth(views, score)
+    score = favouring_base(smooth(views, score))
     part = score.argmax(-1)
     chosen = part[..., None, None].expand(*part.shape, 1, 3)
     points = evidence.points.gather(2, chosen)[:, :, 0].flatten(0, 1)
@@ -174,6 +174,15 @@ def rebuild(
     seen = evidence.seen.gather(2, part[..., None])[..., 0].flatten()
     good = (support > SUPPORTED) & (seen > max(1.0, SEEN * min(OBSERVERS, len(order))))
     _resample(template, points, normals, score.flatten(0, 1), support, good)
+
+
+def favouring_base(score: Float[Tensor, "B K P"]) -> Float[Tensor, "B K P"]:
+    """Log support with a bonus for the base: less where it would leave a part almost nothing."""
+    base = F.one_hot(torch.tensor(0), score.shape[-1]).to(score)
+    favoured = score + BASE_BONUS * base
+    count = favoured.argmax(-1).flatten().bincount(minlength=score.shape[-1])
+    scarce = bool(count.min() < LEAST_PART * count.sum())
+    return score + LEAST_BONUS * base if scarce else favoured
 
 
 def _resample(
