@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
@@ -18,7 +19,10 @@ from scapo.store.schema import StoreError
 from scapo.types import Observation, Prediction
 
 RELEASED = "weights"
-"""Folder in the package with one checkpoint per released category."""
+"""Folder in the package with the released checkpoints: CATEGORY.safetensors of the method that
+answers by default, CATEGORY-METHOD.safetensors of others."""
+CHECKOUT = Path("results", "checkpoints")
+"""The same folder in a checkout, from which the package's is made."""
 
 
 class Predictor:
@@ -51,14 +55,21 @@ class Predictor:
 
         Raises:
             ValueError: Another shape, no cloud, fewer points than the method needs, values that
-                are not finite.
+                are not finite, another mode.
         """
+        if mode not in get_args(Mode):
+            raise ValueError(f"mode: expected one of {', '.join(get_args(Mode))}, found {mode!r}")
         cloud, least = self._tensor(points), self.model.least_points
         short = cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < least
         if short or cloud.numel() == 0:
             raise ValueError(
                 f"points: expected shape (..., N, 3) with N at least {least} and at least one "
                 f"cloud, found {tuple(cloud.shape)}"
+            )
+        if lost := int((~torch.isfinite(cloud).all(-1)).sum()):
+            raise ValueError(
+                f"points: expected finite coordinates, found NaN or infinity in {lost:,} of "
+                f"{cloud[..., 0].numel():,} points; leave those out"
             )
         shape = cloud.shape[:-2]
         centre = None if sensor is None else self._tensor(sensor).expand(*shape, 3).reshape(-1, 3)
@@ -85,7 +96,8 @@ def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
 
     Args:
         path_or_category: A run folder, a checkpoint file, or the name of a category whose
-            weights come with the package.
+            weights come with the package, such as `oven`; `oven/scapo` for those of a method that
+            is not the default.
         device: Where it runs.
 
     Raises:
@@ -103,13 +115,24 @@ def find(path_or_category: str | Path) -> Path:
     path = Path(path_or_category)
     if path.exists():
         return path
-    released = Path(str(files("scapo"))) / RELEASED
-    if str(path_or_category) in CATEGORIES:
-        path = released / f"{path_or_category}.safetensors"
-        if path.is_file():
-            return path
-    known = ", ".join(sorted(item.stem for item in released.glob("*.safetensors"))) or "none yet"
+    weights = {name.replace("-", "/", 1): file for name, file in _weights().items()}
+    if str(path_or_category) in weights:
+        return weights[str(path_or_category)]
+    known = ", ".join(weights) or "none yet"
     raise StoreError(
         f"{path_or_category}: expected a run folder, a checkpoint or a category with released "
         f"weights ({known}), found none"
     )
+
+
+def released() -> dict[str, Path]:
+    """Checkpoints that come with the package, by category: each of its default method."""
+    return {name: path for name, path in _weights().items() if name in CATEGORIES}
+
+
+def _weights() -> dict[str, Path]:
+    """Every checkpoint that comes with the package or the checkout, by the name of its file."""
+    package = Path(str(files("scapo")))
+    folders = (package / RELEASED, package.parent / CHECKOUT)
+    found = [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
+    return {path.stem: path for path in found if path.stem.partition("-")[0] in CATEGORIES}

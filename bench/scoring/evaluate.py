@@ -16,20 +16,15 @@ from bench.requests import Request, Settings
 from bench.scoring.ambiguity import check_alike, score_best
 from bench.scoring.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.scoring.compat_files import Canon, check_record, fit_canon, score_compat
-from bench.scoring.predictions import Header, Predictions, read_prediction_header
 from bench.scoring.score_files import Run, side_file, writing
 from bench.scoring.scores import Errors, Frames, Rows, score
 from bench.scoring.summary import by_trait, summarise
 from bench.scoring.truth import Truth, blocks, revolute, symmetry
 from bench.statistics import BOOTSTRAP_SEED
-from scapo.store import Split, StoreError, open_split, sha256_file
+from scapo.store import Split, StoreError, sha256_file
+from scapo.store.predictions import Header, Predictions, find_data, read_prediction_header
 from scapo.store.provenance import commit, machine
-from scapo.text import one_line
-
-PARTS = ("clean", "complete", "isolated", "sensor", "real")
-"""Folders above the categories that say what the data are."""
-PROTOCOLS = {"full": "complete", "isolated": "isolated"}
-"""How the clouds were taken -> the part that such data belong to."""
+from scapo.store.split import data_name
 
 
 def evaluate(request: Request) -> dict[str, Any]:
@@ -98,29 +93,6 @@ def run_of(request: Request, header: Header, split: Split) -> Run:
         category=header.category,
         split=header.split,
     )
-
-
-def data_name(folder: Path, split: Split) -> str:
-    """`NAME@DIGEST`: what the data are called, and the first 12 digits of their digest.
-
-    NAME is the manifest's option `benchmark`, else the folder above the category where that is
-    part of the data set or of the benchmark (`PARTS`), else `complete` for whole surfaces,
-    `isolated` for parts rendered alone, `sensor` for data with sensor noise, `clean` without.
-    """
-    manifest, root = split.manifest, folder.resolve()
-    named = manifest.options.get("benchmark")
-    above = split.folder.resolve().parent.parent
-    inside = above != root and above.is_relative_to(root)
-    if isinstance(named, str) and named:
-        name = one_line(named, 100)
-    elif inside or above.name in PARTS:
-        name = above.name
-    elif (protocol := str(manifest.options.get("protocol"))) in PROTOCOLS:
-        name = PROTOCOLS[protocol]
-    else:
-        noisy = manifest.options.get("noise", "none") != "none"
-        name = "sensor" if noisy else "clean"
-    return f"{name}@{manifest.digest[:12]}"
 
 
 def _report(
@@ -211,26 +183,6 @@ def open_data(request: Request) -> tuple[Header, Split]:
     return header, find_data(request.data, header)
 
 
-def find_data(folder: Path, header: Header) -> Split:
-    """The split that a header names, its bytes verified.
-
-    Where several data sets below `folder` have that category and split (the benchmark's `clean`
-    and `sensor` both have laptops), the digest decides.
-
-    Raises:
-        StoreError: Not found, not unique, or changed shards.
-    """
-    pattern = f"*/{header.category}/{header.split}/manifest.json"
-    candidates = [Split(path.parent) for path in sorted(folder.glob(pattern))]
-    fitting = [split for split in candidates if split.manifest.digest == header.data_digest]
-    if len(candidates) > 1 and len(fitting) == 1:
-        found = fitting[0]
-    else:
-        found = open_split(folder, header.category, header.split)
-    found.verify()
-    return found
-
-
 def fit_frames(
     request: Request, header: Header, split: Split, predictions: Predictions
 ) -> Prepared:
@@ -252,7 +204,7 @@ def fit_frames(
     path = request.calibration
     trained = read_prediction_header(path)
     check_calibration(path, trained, header)
-    train = find_data(request.data, trained)
+    train = find_training(request.data, trained, split)
     fitted = fit(path, train, settings=request.settings, frames=frames)
     record = fitted.record() | {"sha256": sha256_file(path), "data": train.manifest.digest}
     canon = None
@@ -262,6 +214,29 @@ def fit_frames(
     return Prepared(
         frames=_with_offsets(frames, fitted), order=fitted.order, canon=canon, record=record
     )
+
+
+def find_training(folder: Path, trained: Header, scored: Split) -> Split:
+    """The split that calibrates: in the data, else in another part of the benchmark beside them.
+
+    Real objects have no training split: their models were trained on `clean` or `sensor`.
+
+    Raises:
+        StoreError: Not found in either, or changed shards.
+    """
+    try:
+        found = find_data(folder, trained)
+    except StoreError:
+        found = None
+    if found is not None and found.manifest.digest == trained.data_digest:
+        return found
+    parts = scored.folder.resolve().parent.parent.parent
+    for path in sorted(parts.glob(f"*/{trained.category}/{trained.split}/manifest.json")):
+        other = Split(path.parent)
+        if other.manifest.digest == trained.data_digest:
+            other.verify()
+            return other
+    return found or find_data(folder, trained)
 
 
 def _with_offsets(frames: Frames, fitted: Fitted) -> Frames:

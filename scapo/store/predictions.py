@@ -19,13 +19,26 @@ import numpy as np
 from jaxtyping import Bool, Num
 from safetensors import SafetensorError, safe_open
 
-from bench.compat.readings import RECORD
 from scapo.geometry.matrices import rotation_error
-from scapo.store import PREDICTIONS, Split, StoreError, read_header, write
+from scapo.store.files import PREDICTIONS, read_header, write
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
+from scapo.store.schema import StoreError
+from scapo.store.split import Split, open_split
 from scapo.types import Supervision
 
+RECORD = (
+    "R_select",
+    "T_select",
+    "S_joint",
+    "S_drct",
+    "S_angl",
+    "I_joint",
+    "I_drct",
+    "I_angl",
+)
+"""The network-side quantities of OP-Align: rotation and translation chosen for the input, and
+pivots, directions and pairs of states on the aligned input (S) and the canonical shape (I)."""
 LONGEST_NAME = 200
 """Characters of a name in the header."""
 DIGEST_KEYS = ("data_digest", "digest", "data")
@@ -170,6 +183,26 @@ def check_belongs(path: Path, header: Header, manifest: Manifest) -> None:
             raise StoreError(
                 f"{path}: header field {name!r}: expected {want!r} as in the data, found {have!r}"
             )
+
+
+def find_data(folder: Path, header: Header) -> Split:
+    """The split that a header names, its bytes verified.
+
+    Where several data sets below `folder` have that category and split (the benchmark's `clean`
+    and `sensor` both have laptops), the digest decides.
+
+    Raises:
+        StoreError: Not found, not unique, or changed shards.
+    """
+    pattern = f"*/{header.category}/{header.split}/manifest.json"
+    candidates = [Split(path.parent) for path in sorted(folder.glob(pattern))]
+    fitting = [split for split in candidates if split.manifest.digest == header.data_digest]
+    if len(candidates) > 1 and len(fitting) == 1:
+        found = fitting[0]
+    else:
+        found = open_split(folder, header.category, header.split)
+    found.verify()
+    return found
 
 
 class Predictions:

@@ -8,13 +8,13 @@ import pytest
 
 from bench.requests import Request
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import (
+from scapo.store import StoreError
+from scapo.store.predictions import (
     WEIGHT_TOLERANCE,
     Predictions,
     check_rows,
     read_prediction_header,
 )
-from scapo.store import StoreError
 from tests.helpers import made
 from tests.helpers.damaged import DAMAGE, file_bytes, header_json
 
