@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export LP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup vulkan demo test test-quick coverage fuzz lint format bench lock dist clean
+.PHONY: help setup vulkan demo demo-train test test-quick coverage fuzz lint format bench lock dist clean
 
 help: ## these lines
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -22,8 +22,12 @@ setup: ## .venv with the locked packages and a Vulkan driver (PYTHON=python3.12,
 vulkan: ## look for a Vulkan device again, and install a driver where there is none
 	@scripts/vulkan.sh
 
-demo: setup ## the whole idea: generate two categories, train, score, print the table, draw pictures
+demo: setup ## the whole idea: render, predict by the released models, score, print the table, make twins
 	@$(BIN)/python -m bench.demo $(ARGS)
+
+demo-train: setup ## the same of ovens with a model that is trained from scratch, about 15 minutes
+	@$(BIN)/python -m bench.demo --out results/demo-train --categories oven --train 640 --test 200 \
+	  --methods registered icp $(ARGS)
 
 test: setup ## all tests, shapes checked (JOBS=2, ARGS="-k geometry")
 	@$(BIN)/python -m pytest -n $(JOBS) --dist loadscope --durations=8 $(ARGS)

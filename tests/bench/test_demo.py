@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bench.demo import Demo, StepError, Steps, cell_text, closing_words, summary
+from bench.demo import TABLE1, Demo, StepError, Steps, cell_text, closing_words, summary
 
 
 def cell(method: str, source: str, column: str, value: str, block: str = "S") -> dict[str, str]:
@@ -26,7 +26,7 @@ def printed(table: object) -> str:
 def test_summary_shows_ours_beside_print_for_the_demo_categories_only() -> None:
     text = printed(
         summary(
-            Demo(),
+            Demo(categories=("laptop", "oven")),
             [
                 cell("SCAPO", "paper", "Laptop", "93.41"),
                 cell("SCAPO (cpu)", "ours", "Laptop", "56.97"),
@@ -70,8 +70,14 @@ def test_steps_are_timed_and_logged_one_file_each(tmp_path: Path) -> None:
     assert "scapo-data --help" in console.file.getvalue()
 
 
-def test_closing_words_name_the_folders(tmp_path: Path) -> None:
-    text = closing_words(Demo(out=tmp_path, train=7, epochs=3), 90.0)
+def test_closing_words_name_the_folders_and_what_answered(tmp_path: Path) -> None:
+    text = closing_words(Demo(out=tmp_path, train=7, methods=("icp",)), 90.0)
     assert f"{tmp_path}/tables/" in text
-    assert "1.5 minutes: 7 training" in text
-    assert "3 epochs" in text
+    assert "1.5 minutes" in text
+    assert "trained from scratch on 7 clouds: icp" in text
+    assert f"{tmp_path}/twins/" in closing_words(Demo(out=tmp_path), 60.0)
+
+
+def test_categories_are_those_of_table_1_that_have_models() -> None:
+    assert set(Demo().categories) <= set(TABLE1)
+    assert Demo(categories=("drawer",)).categories == ("drawer",)
