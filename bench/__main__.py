@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         say(errors, f"scapo-bench: {error}")
         sys.exit(1)
     except KeyboardInterrupt as stop:
-        say(errors, f"scapo-bench: {stop or 'interrupted'}")
+        say(errors, f"scapo-bench: {str(stop) or 'interrupted'}")
         sys.exit(130)
 
 
