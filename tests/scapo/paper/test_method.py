@@ -13,7 +13,8 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Step
 from scapo.paper.autoencoder import EncoderConfig
-from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
+from scapo.paper.config import ScapoConfig, cpu_config
+from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator, is_rotation, rigid_motions

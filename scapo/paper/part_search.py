@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: MIT
+"""Where stage 2 begins: parts and joints found from several starts, judged without labels.
+
+Not in the paper, which says nothing of how keypoints, bones and joints begin. From the P-means of
+one shape the skinning of stage 2 settles on whatever halves those are (a laptop is cut across its
+hinge), and the terms of Sec. 3.3 hold it there. Here the blend skinning of Sec. 3.2 is fitted to
+clouds that stage 1 has aligned, without networks: a template with bones and joints for all, and for
+each cloud its states, what is left of its pose, and three sizes. Many splits of the template are
+tried on few clouds, the best go on with more, and clouds that no start was fitted to decide.
+
+Frames: `aligned`, where the clouds are; `template`. Lengths in normalised units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from scapo.categories import JointKind
+from scapo.geometry.points import farthest_points, gather, nearest
+from scapo.geometry.rigid import joint_motion
+from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.paper.skinning import deform, gaussian_weights
+
+Kinds = tuple[JointKind, ...]
+T = TypeVar("T", "Skeleton", "Placements")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchConfig:
+    """How widely the start of stage 2 is looked for."""
+
+    seeds: int = 10
+    """Points of the template around which a part may be."""
+    clouds: tuple[int, ...] = (16, 32, 64)
+    """Clouds fitted in each round; as many others judge."""
+    kept: tuple[int, ...] = (6, 2)
+    """Starts that go on from each round but the last."""
+    steps: tuple[int, ...] = (40, 60, 150)
+    """Steps of Adam in each round."""
+    points: int = 512
+    """Of the template."""
+    asked: int = 256
+    """Points of each cloud, and of the template, whose nearest is looked for in a step."""
+    rate: float = 0.02
+    """Learning rate of poses and states."""
+    reach: float = 1.2
+    """States that are tried lie within this many radians either side of 0."""
+    spread: float = 0.03
+    """Added to the deviations of a part's points where its bone begins."""
+    taught: int = 1000
+    """Clouds that are placed, for the networks to be fitted to."""
+    placing: int = 40
+    """Steps of Adam for that."""
+    teaching: int = 400
+    """Steps of Adam of the networks."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Skeleton:
+    """A template with bones and joints: what all clouds share."""
+
+    points: Float[Tensor, "M 3"]
+    keypoints: Float[Tensor, "P 3"]
+    factor: Float[Tensor, "P 3 3"]
+    """L of each bone; Q / gamma is L^T L."""
+    pivot: Float[Tensor, "J 3"]
+    axis: Float[Tensor, "J 3"]
+
+    def precision(self) -> Float[Tensor, "P 3 3"]:
+        """Q / gamma of each bone."""
+        return self.factor.mT @ self.factor
+
+    def weights(self) -> Float[Tensor, "M P"]:
+        """w of the template's points."""
+        return gaussian_weights(self.points[None], self.keypoints[None], self.precision())[0]
+
+    def laid_over(self, shape: Float[Tensor, "K 3"]) -> Skeleton:
+        """With as many points as a shape, each the nearest to one of it that is left."""
+        from scipy.optimize import linear_sum_assignment
+
+        cost = torch.cdist(shape, self.points).square()
+        _, column = linear_sum_assignment(cost.cpu().numpy())
+        return replace(self, points=self.points[torch.as_tensor(column)])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placements:
+    """How each cloud lies and stands."""
+
+    turn: Float[Tensor, "B 3"]
+    """Rotation vector of aligned_R_template, of the base."""
+    shift: Float[Tensor, "B 3"]
+    size: Float[Tensor, "B 3"]
+    """Logarithms of the scales along the template's axes."""
+    state: Float[Tensor, "B J"]
+
+
+def values(of: Skeleton | Placements) -> list[Tensor]:
+    """What can be learned, in the order of the fields."""
+    return [getattr(of, one.name) for one in fields(of)]
+
+
+def having(of: T, new: Iterable[Tensor]) -> T:
+    """The same with other values, in the order of the fields."""
+    return replace(of, **{one.name: value for one, value in zip(fields(of), new, strict=True)})
+
+
+def motionless(clouds: Float[Tensor, "B N 3"], joints: int) -> Placements:
+    """Where everything begins."""
+    zero = clouds.new_zeros(len(clouds), 3)
+    return Placements(turn=zero, shift=zero, size=zero, state=clouds.new_zeros(len(clouds), joints))
+
+
+def posed(s: Skeleton, at: Placements, kinds: Kinds) -> Float[Tensor, "B M 3"]:
+    """The template as each cloud has it."""
+    size = at.size.exp()[:, None]
+    points, pivot = s.points * size, s.pivot * size
+    axis = F.normalize(s.axis, dim=-1).expand_as(pivot)
+    eye = torch.eye(4, dtype=points.dtype, device=points.device).expand(len(size), 4, 4)
+    moves = [
+        joint_motion(pivot[:, j], axis[:, j], at.state[:, j], kind) for j, kind in enumerate(kinds)
+    ]
+    weights = s.weights().expand(len(size), -1, -1)
+    moved = deform(torch.stack([eye, *moves], 1), points, weights)
+    return moved @ rotvec_to_rotmat(at.turn).mT + at.shift[:, None]
+
+
+def misfit(
+    clouds: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"], asked: int, offset: int = 0
+) -> Float[Tensor, " B"]:
+    """Mean distance to the nearest point, both ways: strangers weigh less than when squared.
+
+    All points are there to be found, but about `asked` of each side ask. How far the nearest is
+    depends on how densely the other side is sampled, and that may be more than a door that moves.
+    """
+    some, others = _every(clouds, asked, offset), _every(shapes, asked, offset)
+    there = (some - gather(shapes, nearest(some, shapes))).square().sum(-1)
+    back = (others - gather(clouds, nearest(others, clouds))).square().sum(-1)
+    return (there + 1e-6).sqrt().mean(-1) + (back + 1e-6).sqrt().mean(-1)
+
+
+def _every(
+    points: Float[Tensor, "B N 3"], count: int, offset: int
+) -> Float[Tensor, "B K 3"]:
+    step = max(1, points.shape[1] // count)
+    return points[:, offset % step :: step]
+
+
+@torch.no_grad()
+def with_best_states(
+    clouds: Float[Tensor, "B N 3"], s: Skeleton, at: Placements, kinds: Kinds, c: SearchConfig
+) -> Placements:
+    """Each joint's state replaced where one of seven others fits better."""
+
+    def cost(state: Tensor) -> Tensor:
+        return misfit(clouds, posed(s, replace(at, state=state), kinds), c.asked // 2)
+
+    state = at.state
+    for j, kind in enumerate(kinds):
+        least, best = cost(state), state
+        reach = c.reach if kind == "revolute" else c.reach / 4
+        for value in torch.linspace(-reach, reach, 7).tolist():
+            other = state.clone()
+            other[:, j] = value
+            found = cost(other)
+            best = torch.where((found < least)[:, None], other, best)
+            least = torch.minimum(found, least)
+        state = best
+    return replace(at, state=state)
+
+
+def held(s: Skeleton, at: Placements) -> Float[Tensor, ""]:
+    """No part is empty, keypoints are centroids, and placements lie about the template's own."""
+    weights = s.weights()
+    mass = F.relu(0.04 - weights.mean(0)).sum()
+    centroid = weights.mT @ s.points / weights.sum(0).clamp(min=1e-3)[:, None]
+    middle = torch.stack([value.mean(0).square().sum() for value in values(at)]).sum()
+    return 5 * mass + (s.keypoints - centroid).square().sum() + 0.1 * middle
+
+
+RATES = (0.25, 0.5, 25.0, 0.5, 1.0)
+"""Learning rates of a skeleton's fields as multiples of `SearchConfig.rate`."""
+
+
+@torch.enable_grad()
+def fit(
+    clouds: Float[Tensor, "B N 3"], s: Skeleton, kinds: Kinds, c: SearchConfig, steps: int
+) -> Skeleton:
+    """The skeleton after so many steps of Adam on it and on the placements of the clouds."""
+    return _descend(clouds, s, kinds, c, steps, learned=True)[0]
+
+
+def place(
+    clouds: Float[Tensor, "B N 3"], s: Skeleton, kinds: Kinds, c: SearchConfig, steps: int
+) -> tuple[Placements, Float[Tensor, " B"]]:
+    """How the skeleton lies in each cloud, and the misfit that is left."""
+    found, left = [], []
+    for some in clouds.split(64):
+        with torch.enable_grad():
+            at = _descend(some, s, kinds, c, steps, learned=False)[1]
+        with torch.no_grad():
+            left.append(misfit(some, posed(s, at, kinds), 2 * c.asked))
+        found.append(values(at))
+    columns = [torch.cat(column) for column in zip(*found, strict=True)]
+    return having(motionless(clouds, len(kinds)), columns), torch.cat(left)
+
+
+def _descend(
+    clouds: Float[Tensor, "B N 3"],
+    s: Skeleton,
+    kinds: Kinds,
+    c: SearchConfig,
+    steps: int,
+    *,
+    learned: bool,
+) -> tuple[Skeleton, Placements]:
+    """Adam on the placements, and on the skeleton where it is learned."""
+    at = with_best_states(clouds, s, motionless(clouds, len(kinds)), kinds, c)
+    own = [value.clone().requires_grad_() for value in values(at)]
+    common = [value.clone().requires_grad_(learned) for value in values(s)]
+    rates = [c.rate] * len(own) + [c.rate * rate for rate in RATES] * learned
+    learning = own + common * learned
+    groups = [{"params": [one], "lr": rate} for one, rate in zip(learning, rates, strict=True)]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    for k in range(steps):
+        s, at = having(s, common), having(at, own)
+        if k in (steps // 4, steps // 2):
+            own[-1].data.copy_(with_best_states(clouds, s, at, kinds, c).state)
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * 0.1 ** (k / steps)
+        cost = misfit(clouds, posed(s, at, kinds), c.asked, k).mean()
+        cost = cost + 0.05 * at.size.square().mean() + (held(s, at) if learned else 0.0)
+        optimizer.zero_grad()
+        cost.backward()
+        optimizer.step()
+    ended = (having(s, [x.detach() for x in common]), having(at, [x.detach() for x in own]))
+    return ended
+
+
+def split_skeleton(
+    points: Float[Tensor, "M 3"], children: list[Bool[Tensor, " M"]], spread: float
+) -> Skeleton:
+    """Bones and joints of a split: Gaussians of the parts, hinges along the boundaries.
+
+    Args:
+        points: Of the template.
+        children: For each child, which points it has; the others are the base's.
+        spread: Added to the deviations of a part's points.
+    """
+    base = ~torch.stack(children).any(0)
+    factors, pivots, axes = [], [], []
+    for some in (base, *children):
+        deviations, vectors = _main_directions(points[some])
+        factors.append((vectors * (0.5**0.5 / (deviations + spread))) @ vectors.mT)
+    for some in children:
+        gap = torch.cdist(points[some], points[base]).amin(1)
+        edge = points[some][gap.topk(max(6, len(points) // 24), largest=False).indices]
+        axes.append(_main_directions(edge)[1][:, -1])
+        pivots.append(edge.mean(0))
+    return Skeleton(
+        points=points,
+        keypoints=torch.stack([points[some].mean(0) for some in (base, *children)]),
+        factor=torch.stack(factors),
+        pivot=torch.stack(pivots),
+        axis=torch.stack(axes),
+    )
+
+
+def _main_directions(points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " 3"], Tensor]:
+    """Standard deviations, rising, and the directions as columns."""
+    centred = points - points.mean(0)
+    variance, vectors = torch.linalg.eigh(centred.mT @ centred / len(points))
+    return variance.clamp(min=0).sqrt(), vectors
+
+
+def splits(
+    points: Float[Tensor, "M 3"], joints: int, seeds: int
+) -> list[list[Bool[Tensor, " M"]]]:
+    """Which points each child may have: halves and ends along the main directions, and balls."""
+    count, least = len(points), len(points) // 5
+    ranks = [along.argsort().argsort() for along in (points @ _main_directions(points)[1]).T]
+    ends = [[rank < least, rank >= count - least] for rank in ranks]
+    first = int((points - points.mean(0)).norm(dim=1).argmax())
+    chosen = farthest_points(points, seeds, start=first)
+    balls = [row.argsort().argsort() < least for row in torch.cdist(points[chosen], points)]
+    if joints == 1:
+        halves = [rank < count // 2 for rank in ranks]
+        return [[some] for some in (*halves, *sum(ends, []), *balls)]
+    apart = [
+        [one, other]
+        for i, one in enumerate(balls)
+        for other in balls[:i]
+        if not bool((one & other).any())
+    ]
+    return ends + apart
+
+
+def search(
+    template: Float[Tensor, "M 3"], clouds: Float[Tensor, "B N 3"], kinds: Kinds, c: SearchConfig
+) -> tuple[Skeleton, list[list[float]]]:
+    """The start that explains clouds best which it was not fitted to.
+
+    Args:
+        template: A shape of the category in the aligned frame.
+        clouds: Aligned; the first half is fitted, the second judges.
+        kinds: Of the joints.
+        c: How widely.
+
+    Returns:
+        It, and of each round the misfit of every start, rising.
+    """
+    fitted, judging = clouds.chunk(2)
+    chosen = template[torch.arange(c.points, device=template.device) * len(template) // c.points]
+    starts = [
+        split_skeleton(chosen, some, c.spread) for some in splits(chosen, len(kinds), c.seeds)
+    ]
+    said = []
+    for number, steps, kept in zip(c.clouds, c.steps, (*c.kept, 1), strict=True):
+        ends = [fit(fitted[:number], start, kinds, c, steps) for start in starts]
+        left = [place(judging[:number], s, kinds, c, max(20, steps // 3))[1].mean() for s in ends]
+        order = torch.stack(left).argsort().tolist()
+        said.append([float(left[k]) for k in order])
+        starts = [ends[k] for k in order[:kept]]
+    return starts[0], said
