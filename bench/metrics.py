@@ -17,14 +17,13 @@ from bench.matching import (
     LabelOrder,
     as_weights,
     choose_order,
-    confusion,
-    hard_labels,
     overlap,
     reorder_joints,
     reorder_poses,
     rotation_degrees,
     soft_confusion,
 )
+from scapo.geometry.part_order import confusion, hard_labels
 
 ApRule = Literal["mean", "min", "per-part"]
 

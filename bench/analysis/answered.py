@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from bench.analysis.ladder import Pieces, predicted_pieces, true_pieces
-from bench.matching import hard_labels
 from bench.scoring.evaluate import Prepared, Request, fit_frames, open_data
-from bench.scoring.predictions import Header, Predictions
 from bench.scoring.scores import Errors, agreement_of, label_of, score
 from bench.scoring.truth import Truth, blocks
+from scapo.geometry.part_order import hard_labels
 from scapo.store import Split
+from scapo.store.predictions import Header, Predictions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

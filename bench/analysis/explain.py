@@ -14,10 +14,10 @@ from bench.analysis.ladder import RUNGS, Rung, climb
 from bench.analysis.strata import Stratum, factors, stratify
 from bench.requests import Request
 from bench.scoring.evaluate import fit_frames, open_data
-from bench.scoring.predictions import Predictions
 from bench.scoring.scores import Errors
 from bench.scoring.truth import blocks
 from bench.statistics import Interval, interval
+from scapo.store.predictions import Predictions
 from scapo.store.provenance import commit
 
 STRATA_COLUMNS = ("factor", "lower", "upper", "metric", "unit", "samples", "mean", "low", "high",

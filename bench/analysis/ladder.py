@@ -26,12 +26,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from bench.matching import apply_calibration, is_swapped, part_orders, reorder_joints, reorder_poses
+from bench.matching import apply_calibration, is_swapped, reorder_joints, reorder_poses
 from bench.metrics import joint_errors, pose_errors, state_errors, unit
 from bench.scoring.scores import Errors, Frames, Rows, Settings, agreement_of, signs
 from bench.scoring.truth import Truth
 from bench.statistics import Interval
 from scapo.geometry import rigid as geometry
+from scapo.geometry.part_order import part_orders
 from scapo.text import as_markdown
 
 Rung = Literal["predicted", "recomposed", "pose", "parts", "joint", "state", "all"]

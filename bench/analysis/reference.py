@@ -19,10 +19,10 @@ from scipy.spatial import KDTree
 
 from bench.matching import project_rotations
 from bench.requests import Kind
-from bench.scoring.predictions import Header, write_predictions
 from bench.scoring.truth import Truth, blocks, revolute
 from scapo.geometry import rigid as geometry
 from scapo.store import Arrays, Split, open_split
+from scapo.store.predictions import Header, write_predictions
 
 RECIPE = "scapo-reference/1"
 """To be changed with what the references answer: scores of another recipe are made again."""

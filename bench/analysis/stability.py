@@ -22,10 +22,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from bench.matching import hard_labels, project_rotations, rotation_degrees
+from bench.matching import project_rotations, rotation_degrees
 from bench.metrics import line_degrees, unit
 from bench.scoring.scores import Errors, Rows, label_of
 from bench.statistics import BOOTSTRAP_SEED, bounds
+from scapo.geometry.part_order import hard_labels
 from scapo.paper.augment import random_pose
 
 Answer = Callable[[Float[np.ndarray, "B N 3"], Float[np.ndarray, "B 3"]], Rows]

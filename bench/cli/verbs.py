@@ -70,13 +70,13 @@ class Tables:
 
     Table 1 is on single views (clean), 1-complete on whole surfaces, 1b on parts seen alone
     (isolated), 4 has mean errors on sensor data and on further categories, 5 real models, 6 objects
-    unlike those of training by what sets them apart (test-ood).
+    unlike those of training by what sets them apart (test-ood), 7 what `scapo-data actuate` found.
     """
 
     scores: Path = Path("results/scores")
-    """Folder with NAME.csv.gz files, searched through."""
+    """Folder with NAME.csv.gz files and those of `scapo-data actuate`, searched through."""
     out: Path = Path("results/tables")
-    """Folder for table{1,1-complete,1b,2,3,4,5,6}.{md,csv,tex} and significance.csv."""
+    """Folder for table{1,1-complete,1b,2,3,4,5,6,7}.{md,csv,tex} and significance.csv."""
     split: str = "test"
     """Split of all tables but 6, which has test-ood beside it."""
     ap_rule: ApRule = "mean"

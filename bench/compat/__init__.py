@@ -2,10 +2,9 @@
 """The published evaluators' readings, for comparison with printed numbers only."""
 
 from bench.compat.eap import eap_calibration, eap_iou, eap_rotation
-from bench.compat.readings import RECORD, opalign, score_record, standardise
+from bench.compat.readings import opalign, score_record, standardise
 
 __all__ = [
-    "RECORD",
     "eap_calibration",
     "eap_iou",
     "eap_rotation",

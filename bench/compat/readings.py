@@ -18,17 +18,12 @@ from jaxtyping import Bool, Float, Int
 
 from bench.compat.chain import Chain, inverse_chain, straight_chain
 from bench.compat.eap import eap_calibration, eap_iou, eap_rotation
-from bench.matching import (
-    nearest_orthogonal,
-    order_scores,
-    part_orders,
-    project_rotations,
-    rotation_degrees,
-)
+from bench.matching import nearest_orthogonal, project_rotations, rotation_degrees
 from bench.metrics import unit
+from scapo.geometry.part_order import order_scores, part_orders
+from scapo.store.predictions import RECORD
 
 __all__ = [
-    "RECORD",
     "SYMMETRY",
     "Chain",
     "consensus",
@@ -52,19 +47,6 @@ SYMMETRY: dict[str, tuple[tuple[int, int, int], ...]] = {
     "suitcase_output": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
 }
 """Rotation of the true poses of swapped samples by OP-Align's category id (docs/protocol.md)."""
-
-RECORD = (
-    "R_select",
-    "T_select",
-    "S_joint",
-    "S_drct",
-    "S_angl",
-    "I_joint",
-    "I_drct",
-    "I_angl",
-)
-"""The network-side quantities of OP-Align: rotation and translation chosen for the input, and
-pivots, directions and pairs of states on the aligned input (S) and the canonical shape (I)."""
 
 _DRAWS, _SIZE = 100, 5
 _ROTATION_INLIER, _TRANSLATION_INLIER = 10.0, 0.25

@@ -16,10 +16,10 @@ from bench.analysis.answered import Answered
 from bench.figures.drawing import plain, save
 from bench.metrics import sample_errors
 from bench.run_files import read_metrics
-from bench.scoring.predictions import read_prediction_header
 from bench.scoring.scores import Errors
 from scapo import store
 from scapo.drawing import draw_axis, draw_cloud
+from scapo.store.predictions import read_prediction_header
 from scapo.store.samples import UNLABELLED
 
 TRUE_AXIS, PREDICTED_AXIS = "black", "#cc3311"

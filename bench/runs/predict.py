@@ -16,13 +16,13 @@ from bench.methods import find, load
 from bench.requests import PredictRequest
 from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
-from bench.scoring.predictions import Header, write_predictions
 from scapo.method import AbstractMethod, OracleMethod, evenly
 from scapo.records import map_tensors
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import require_fields
 from scapo.store.files import Arrays
 from scapo.store.files import Header as StoredHeader
+from scapo.store.predictions import Header, write_predictions
 from scapo.store.provenance import machine
 from scapo.store.samples import SampleDataset, label, observe, observed
 from scapo.types import Prediction

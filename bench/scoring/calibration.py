@@ -14,20 +14,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from bench.matching import (
-    Calibration,
-    accuracies,
-    calibrate,
-    confusion,
-    hard_labels,
-    part_orders,
-    reorder_joints,
-    reorder_poses,
-)
-from bench.scoring.predictions import Header, Predictions
+from bench.matching import Calibration, accuracies, calibrate, reorder_joints, reorder_poses
 from bench.scoring.scores import Frames, Rows, Settings, agreement_of, label_of, signs
 from bench.scoring.truth import Truth, blocks
+from scapo.geometry.part_order import confusion, hard_labels, part_orders
 from scapo.store import Split, StoreError
+from scapo.store.predictions import Header, Predictions
 
 CALIBRATION_SPLIT = "train"
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from bench.compat.readings import RECORD, Chain, consensus, score_record, standardise
+from bench.compat.readings import Chain, consensus, score_record, standardise
 from bench.matching import as_weights
-from bench.scoring.predictions import Predictions
 from bench.scoring.scores import Errors, Frames, Rows, label_of
 from bench.scoring.truth import Truth, blocks
 from scapo.store import Split, StoreError
+from scapo.store.predictions import RECORD, Predictions
 
 RELEASED = Chain(revolute=True, corrected=False)
 RANSAC_SEED = 1234

@@ -6,7 +6,6 @@ from __future__ import annotations
 import platform
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,20 +15,15 @@ from bench.requests import Request, Settings
 from bench.scoring.ambiguity import check_alike, score_best
 from bench.scoring.calibration import Fitted, check_calibration, dataset_order, fit
 from bench.scoring.compat_files import Canon, check_record, fit_canon, score_compat
-from bench.scoring.predictions import Header, Predictions, read_prediction_header
 from bench.scoring.score_files import Run, side_file, writing
 from bench.scoring.scores import Errors, Frames, Rows, score
 from bench.scoring.summary import by_trait, summarise
 from bench.scoring.truth import Truth, blocks, revolute, symmetry
 from bench.statistics import BOOTSTRAP_SEED
-from scapo.store import Split, StoreError, open_split, sha256_file
+from scapo.store import Split, StoreError, sha256_file
+from scapo.store.predictions import Header, Predictions, find_data, read_prediction_header
 from scapo.store.provenance import commit, machine
-from scapo.text import one_line
-
-PARTS = ("clean", "complete", "isolated", "sensor", "real")
-"""Folders above the categories that say what the data are."""
-PROTOCOLS = {"full": "complete", "isolated": "isolated"}
-"""How the clouds were taken -> the part that such data belong to."""
+from scapo.store.split import data_name
 
 
 def evaluate(request: Request) -> dict[str, Any]:
@@ -98,29 +92,6 @@ def run_of(request: Request, header: Header, split: Split) -> Run:
         category=header.category,
         split=header.split,
     )
-
-
-def data_name(folder: Path, split: Split) -> str:
-    """`NAME@DIGEST`: what the data are called, and the first 12 digits of their digest.
-
-    NAME is the manifest's option `benchmark`, else the folder above the category where that is
-    part of the data set or of the benchmark (`PARTS`), else `complete` for whole surfaces,
-    `isolated` for parts rendered alone, `sensor` for data with sensor noise, `clean` without.
-    """
-    manifest, root = split.manifest, folder.resolve()
-    named = manifest.options.get("benchmark")
-    above = split.folder.resolve().parent.parent
-    inside = above != root and above.is_relative_to(root)
-    if isinstance(named, str) and named:
-        name = one_line(named, 100)
-    elif inside or above.name in PARTS:
-        name = above.name
-    elif (protocol := str(manifest.options.get("protocol"))) in PROTOCOLS:
-        name = PROTOCOLS[protocol]
-    else:
-        noisy = manifest.options.get("noise", "none") != "none"
-        name = "sensor" if noisy else "clean"
-    return f"{name}@{manifest.digest[:12]}"
 
 
 def _report(
@@ -209,26 +180,6 @@ def open_data(request: Request) -> tuple[Header, Split]:
             f"{request.split!r}, found {header.split!r}"
         )
     return header, find_data(request.data, header)
-
-
-def find_data(folder: Path, header: Header) -> Split:
-    """The split that a header names, its bytes verified.
-
-    Where several data sets below `folder` have that category and split (the benchmark's `clean`
-    and `sensor` both have laptops), the digest decides.
-
-    Raises:
-        StoreError: Not found, not unique, or changed shards.
-    """
-    pattern = f"*/{header.category}/{header.split}/manifest.json"
-    candidates = [Split(path.parent) for path in sorted(folder.glob(pattern))]
-    fitting = [split for split in candidates if split.manifest.digest == header.data_digest]
-    if len(candidates) > 1 and len(fitting) == 1:
-        found = fitting[0]
-    else:
-        found = open_split(folder, header.category, header.split)
-    found.verify()
-    return found
 
 
 def fit_frames(

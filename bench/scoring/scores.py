@@ -9,13 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from bench.matching import (
-    apply_calibration,
-    hard_labels,
-    is_swapped,
-    reorder_joints,
-    reorder_poses,
-)
+from bench.matching import apply_calibration, is_swapped, reorder_joints, reorder_poses
 from bench.metrics import (
     Agreement,
     agree,
@@ -26,6 +20,7 @@ from bench.metrics import (
 )
 from bench.requests import Settings
 from bench.scoring.truth import Truth
+from scapo.geometry.part_order import hard_labels
 
 Rows = dict[str, np.ndarray]
 """Tensors of a predictions file for some samples."""

@@ -2,7 +2,7 @@
 """All tables from scores per sample.
 
 Tables 1, 2 and 3 have the paper's printed numbers beside ours, Table 1 stands on each kind of data,
-and 4 to 6 are ours alone (`bench.tables.means`).
+and 4 to 7 are ours alone (`bench.tables.means`, `bench.tables.actuation`).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from bench.metrics import ApRule
+from bench.tables.actuation import load_actuations, table_7
 from bench.tables.means import table_1, table_4, table_5, table_6
 from bench.tables.model import Block, Cell, Row, Table, mark_best
 from bench.tables.paper import MEAN, Cells, mean_mismatches, printed_cells
@@ -52,7 +53,7 @@ def make_tables(
     """
     results = load(scores, split)
     written: dict[Path, str] = {}
-    for table in build(results, rule):
+    for table in (*build(results, rule), table_7(load_actuations(scores, split))):
         stem = f"table{table.number}"
         written[out / f"{stem}.md"] = to_markdown(table)
         written[out / f"{stem}.csv"] = to_csv(table)

@@ -207,13 +207,20 @@ def _add_mesh(node: Element, link: Link, number: int) -> None:
     SubElement(geometry, "mesh", filename=_mesh_name(link, number), scale="1 1 1")
 
 
-def _add_inertial(node: Element, link: Link, origin: Vector) -> None:
-    """Mass and inertia of the link's bounding box, at a nominal density, at least 1 g and 1 cm."""
-    points = np.concatenate([surface.vertices for surface in link.surfaces]) - origin
-    centre = (points.min(0) + points.max(0)) / 2
+def box_inertia(points: Float[np.ndarray, "N 3"]) -> tuple[float, Vector, Vector]:
+    """Mass (kg), centre and principal moments (kg m2) of the box about points, along its sides.
+
+    At a nominal density; at least 1 g and 1 cm.
+    """
     size = np.maximum(np.ptp(points, axis=0), 0.01)
     mass = max(DENSITY * float(np.prod(size)), 1e-3)
-    moments = mass / 12 * (np.sum(size**2) - size**2)
+    return mass, (points.min(0) + points.max(0)) / 2, mass / 12 * (np.sum(size**2) - size**2)
+
+
+def _add_inertial(node: Element, link: Link, origin: Vector) -> None:
+    """That of the link's bounding box."""
+    points = np.concatenate([surface.vertices for surface in link.surfaces]) - origin
+    mass, centre, moments = box_inertia(points)
     inertial = SubElement(node, "inertial")
     SubElement(inertial, "origin", xyz=_numbers(centre), rpy="0 0 0")
     SubElement(inertial, "mass", value=_numbers([mass]))

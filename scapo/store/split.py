@@ -26,6 +26,7 @@ from scapo.store.json_records import parse_json
 from scapo.store.manifest import Manifest, read_manifest
 from scapo.store.regular import is_odd, read_regular
 from scapo.store.schema import LAYOUT, StoreError, check_samples, sample_shapes
+from scapo.text import one_line
 
 
 class Split:
@@ -178,3 +179,32 @@ def _is_split(folder: Path, category: str | None, split: str) -> bool:
 def open_split(folder: Path | str, category: str | None = None, split: str = "train") -> Split:
     """Find and open a split; see `find_split`."""
     return Split(find_split(Path(folder), category, split))
+
+
+PARTS = ("clean", "complete", "isolated", "sensor", "real")
+"""Folders above the categories that say what the data are."""
+PROTOCOLS = {"full": "complete", "isolated": "isolated"}
+"""How the clouds were taken -> the part that such data belong to."""
+
+
+def data_name(folder: Path, split: Split) -> str:
+    """`NAME@DIGEST`: what the data are called, and the first 12 digits of their digest.
+
+    NAME is the manifest's option `benchmark`, else the folder above the category where that is
+    part of the data set or of the benchmark (`PARTS`), else `complete` for whole surfaces,
+    `isolated` for parts rendered alone, `sensor` for data with sensor noise, `clean` without.
+    """
+    manifest, root = split.manifest, folder.resolve()
+    named = manifest.options.get("benchmark")
+    above = split.folder.resolve().parent.parent
+    inside = above != root and above.is_relative_to(root)
+    if isinstance(named, str) and named:
+        name = one_line(named, 100)
+    elif inside or above.name in PARTS:
+        name = above.name
+    elif (protocol := str(manifest.options.get("protocol"))) in PROTOCOLS:
+        name = PROTOCOLS[protocol]
+    else:
+        noisy = manifest.options.get("noise", "none") != "none"
+        name = "sensor" if noisy else "clean"
+    return f"{name}@{manifest.digest[:12]}"

@@ -356,6 +356,49 @@ class Preview:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Actuate:
+    """Does it open: pull the true object, in SAPIEN, along the path that a predicted joint implies.
+
+    A compliant hand holds the part's free edge; docs/actuate.md says what is measured.
+    """
+
+    predictions: tyro.conf.Positional[Path]
+    """Predictions (safetensors, docs/bring-your-own-method.md)."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    out: Path
+    """File of the results, FILE.csv: one row per sample and joint; `scapo-bench tables` reads it
+    where it lies beside scores."""
+    source: Path | None = None
+    """Source of the objects: the folder of models that the set was made from."""
+    limit: int | None = None
+    """Try only the first so many samples."""
+    workers: int | None = None
+    """Worker processes; by default one per core. 0: work in this process."""
+
+    def run(self, console: Console) -> int:
+        """Pull, print how many moved far enough, and name the objects that were left out."""
+        from sim_assets.actuation.actuate import actuate, left_out, summary
+        from sim_assets.generation.generate import Running
+
+        with progress_bar(console) as show:
+            rows = actuate(
+                self.predictions,
+                self.data,
+                self.out,
+                source=self.source,
+                limit=self.limit,
+                running=Running(workers=self.workers, progress=show),
+            )
+        for line in summary(rows):
+            say(console, line)
+        failed = left_out(rows)
+        say_each(console, failed, label="left out", style="red")
+        say(console, f"Results: {self.out}")
+        return 1 if failed else 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Export:
     """Write a data set in a format that is read without this package.
 
@@ -393,5 +436,6 @@ VERBS: dict[str, type] = {
     "view": View,
     "preview": Preview,
     "export": Export,
+    "actuate": Actuate,
 }
 """In the order of the help."""

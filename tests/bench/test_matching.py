@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from bench import metrics
-from bench.matching import apply_calibration, calibrate, fit_calibration, part_orders
+from bench.matching import apply_calibration, calibrate, fit_calibration
+from scapo.geometry.part_order import part_orders
 from tests.helpers import made
 from tests.helpers.cases import KEYS, random_case
 

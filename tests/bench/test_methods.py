@@ -13,13 +13,13 @@ import torch
 
 from bench.__main__ import main
 from bench.methods import METHODS, all_methods, find, load
-from bench.scoring.predictions import read_prediction_header
 from bench.scoring.score_files import read_scores
 from scapo.categories import CATEGORIES
 from scapo.method import AbstractMethod
 from scapo.records import take
 from scapo.store.checkpoint import config_from
 from scapo.store.files import read
+from scapo.store.predictions import read_prediction_header
 from scapo.training.optimiser import make_optimiser, schedule
 from tests.helpers.small import FLAGS, hinged_data
 from tests.helpers.strategies import generator

@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from bench.__main__ import main
-from bench.scoring.predictions import read_prediction_header
 from bench.scoring.score_files import read_scores
 from scapo import registry
 from scapo.predictor import load
 from scapo.store.files import read, read_header
+from scapo.store.predictions import read_prediction_header
 from tests.helpers.small import hinged_data
 
 FILE = '''

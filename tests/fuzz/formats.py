@@ -17,12 +17,12 @@ import trimesh
 from PIL import Image
 
 from bench.run_files import read_metrics, read_timing
-from bench.scoring.predictions import Predictions
 from bench.scoring.score_files import read_scores
 from scapo.registry import load_method
 from scapo.store import Split, StoreError, sha256_file
 from scapo.store.folders import made_here, whole_folder
 from scapo.store.manifest import Manifest, read_manifest
+from scapo.store.predictions import Predictions
 from scapo.training import fit
 from scapo.training.run_folder import TIMING
 from sim_assets.formats.pickled import UnpickleError

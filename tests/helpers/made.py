@@ -15,11 +15,11 @@ import numpy as np
 import roma
 import torch
 
-from bench.scoring.predictions import Header, write_predictions
 from scapo import categories
 from scapo.geometry import rigid as geometry
 from scapo.store import SAMPLES, Split, canonical_json, sha256_bytes, write, write_bytes
 from scapo.store.manifest import Instance, Manifest, Shard, shards_digest
+from scapo.store.predictions import Header, write_predictions
 
 Arrays = dict[str, np.ndarray]
 

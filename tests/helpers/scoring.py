@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from bench.requests import Request, Settings
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import write_predictions
 from bench.scoring.score_files import read_scores
 from scapo.store import open_split
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 
 

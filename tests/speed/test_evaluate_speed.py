@@ -11,7 +11,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from bench.requests import Request
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import write_predictions
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 
 COUNT = 4000

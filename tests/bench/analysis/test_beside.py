@@ -15,13 +15,13 @@ from bench.analysis.beside import evaluate_beside, score_references
 from bench.analysis.reference import training_split
 from bench.requests import EvaluateRequest, Request, Settings
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import write_predictions
 from bench.scoring.score_files import read_report, read_scores
 from bench.statistics import interval
 from bench.tables.render import to_markdown
 from bench.tables.results import load
 from bench.tables.write import build
 from scapo.store import Split
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 
 KINDS = ("constant", "oracle-pose")

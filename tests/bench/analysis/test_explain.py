@@ -17,11 +17,11 @@ from bench.analysis.strata import factors, stratify
 from bench.figures.explain import helps_most, plot_ladder, plot_strata
 from bench.requests import Request, Settings
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import write_predictions
 from bench.scoring.score_files import read_scores
 from bench.scoring.truth import blocks
 from bench.statistics import Interval
 from scapo.store import StoreError, open_split
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 
 CATEGORIES = ("laptop", "eyeglasses", "drawer")

@@ -26,9 +26,10 @@ from bench.baselines.supervised import (
     poses_by_vote,
     states,
 )
-from bench.matching import joint_order, part_orders, reorder_poses
+from bench.matching import reorder_poses
 from bench.metrics import sample_errors
 from scapo.categories import CATEGORIES
+from scapo.geometry.part_order import joint_order, part_orders
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.geometry.rotations import rotvec_to_rotmat

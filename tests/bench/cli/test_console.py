@@ -12,8 +12,8 @@ from bench.analysis.answered import read_answered
 from bench.figures.overlay import overlay_picture
 from bench.figures.pictures import ranking_picture
 from bench.requests import Request
-from bench.scoring.predictions import write_predictions
 from scapo.store.files import read, write
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 
 NAME = "[/x] :smile: [c] $\\frac{$"

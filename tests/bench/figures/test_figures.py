@@ -34,11 +34,11 @@ from bench.figures.template import (
     template_shape,
 )
 from bench.requests import Request
-from bench.scoring.predictions import write_predictions
 from scapo.categories import category
 from scapo.registered.method import RegisteredConfig, RegisteredScapo
 from scapo.registered.template import Placement
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import TINY, tiny

@@ -19,11 +19,11 @@ from bench.requests import PredictRequest
 from bench.runs import predict as predicting
 from bench.runs.predict import to_arrays
 from bench.runs.train import pick_device
-from bench.scoring.predictions import Predictions, read_prediction_header
 from scapo.method import OracleMethod
 from scapo.paper.method import Scapo
 from scapo.store import open_split
 from scapo.store.files import read, read_header
+from scapo.store.predictions import Predictions, read_prediction_header
 from scapo.store.samples import SampleDataset
 from scapo.store.schema import StoreError
 from scapo.types import Prediction

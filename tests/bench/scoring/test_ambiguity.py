@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from bench.analysis.explain import measure
 from bench.requests import Request, Settings
 from bench.scoring.ambiguity import turned_truth
-from bench.scoring.predictions import write_predictions
 from bench.scoring.truth import blocks, revolute
 from scapo.store import StoreError
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 from tests.helpers.scoring import root, score
 

@@ -12,9 +12,9 @@ from bench.compat.readings import opalign
 from bench.requests import Request, Settings
 from bench.scoring.compat_files import check_record
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import write_predictions
 from scapo import categories
 from scapo.store import Split, StoreError
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 from tests.helpers.scoring import root, score
 

@@ -15,12 +15,13 @@ from bench import __main__ as program
 from bench.cli.verbs import VERBS
 from bench.metrics import sample_errors
 from bench.requests import Request, Settings
-from bench.scoring.evaluate import data_name, evaluate
+from bench.scoring.evaluate import evaluate
 from bench.scoring.score_files import COLUMNS
 from bench.scoring.summary import passes
 from scapo import categories
 from scapo.store import Split, StoreError
 from scapo.store.provenance import commit, machine
+from scapo.store.split import data_name
 from tests.helpers import made
 from tests.helpers.scoring import root, score
 

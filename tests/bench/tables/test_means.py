@@ -10,11 +10,11 @@ import pytest
 
 from bench.requests import Request
 from bench.scoring.evaluate import evaluate
-from bench.scoring.predictions import write_predictions
 from bench.tables.means import table_1, table_4, table_5, table_6
 from bench.tables.paper import printed_cells
 from bench.tables.results import load
 from bench.tables.spec import TABLE_2_CATEGORIES
+from scapo.store.predictions import write_predictions
 from tests.helpers import made
 from tests.helpers.scored import OBJECTS, SAMPLES, make_scores
 

@@ -24,7 +24,7 @@ from bench.tables.significance import COLUMNS, significance_csv
 from bench.tables.spec import PRECISION_KEYS, TABLE_1_CATEGORIES, TABLE_2_CATEGORIES
 from tests.helpers.scored import OBJECTS, SAMPLES, make_scores
 
-NUMBERS = ("1", "1-complete", "1b", "2", "3", "4", "5", "6")
+NUMBERS = ("1", "1-complete", "1b", "2", "3", "4", "5", "6", "7")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,462 @@
+# SPDX-License-Identifier: MIT
+"""Predictions files: the header, the tensors, and the refusal of what is not one.
+
+One safetensors file, written by any program (docs/bring-your-own-method.md). Every complaint is
+one line: `file: tensor: expected, found`. A sample whose whole row of a tensor is NaN has no
+answer there: it is counted and its scores are empty.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, get_args
+
+import numpy as np
+from jaxtyping import Bool, Num
+from safetensors import SafetensorError, safe_open
+
+from scapo.geometry.matrices import rotation_error
+from scapo.store.files import PREDICTIONS, read_header, write
+from scapo.store.manifest import Manifest
+from scapo.store.samples import UNLABELLED
+from scapo.store.schema import StoreError
+from scapo.store.split import Split, open_split
+from scapo.types import Supervision
+
+RECORD = (
+    "R_select",
+    "T_select",
+    "S_joint",
+    "S_drct",
+    "S_angl",
+    "I_joint",
+    "I_drct",
+    "I_angl",
+)
+"""The network-side quantities of OP-Align: rotation and translation chosen for the input, and
+pivots, directions and pairs of states on the aligned input (S) and the canonical shape (I)."""
+LONGEST_NAME = 200
+"""Characters of a name in the header."""
+DIGEST_KEYS = ("data_digest", "digest", "data")
+"""The header field that names the data; the first is ours, the others are read too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """What made a predictions file."""
+
+    method: str
+    variant: str
+    category: str
+    split: str
+    seed: int
+    data_digest: str
+    """`digest` of the manifest of the split that was predicted."""
+    supervision: tuple[Supervision, ...]
+    """Labels that training used."""
+    camera: bool | None = None
+    """Whether training or prediction uses where the camera stands; None: not said."""
+    budget: dict[str, Any] = field(default_factory=dict)
+    """Anything about cost: device, batch, seconds_per_cloud, training_seconds, parameters."""
+    run: dict[str, Any] = field(default_factory=dict)
+    """The training behind it: commit, config, machine, data digest of its split."""
+
+    def record(self) -> dict[str, Any]:
+        """As stored in the file."""
+        return {
+            "format": PREDICTIONS,
+            "method": self.method,
+            "variant": self.variant,
+            "category": self.category,
+            "split": self.split,
+            "seed": self.seed,
+            "data_digest": self.data_digest,
+            "supervision": sorted(self.supervision),
+            "budget": self.budget,
+            "run": self.run,
+            **({} if self.camera is None else {"camera": self.camera}),
+        }
+
+
+def write_predictions(path: Path, header: Header, arrays: Mapping[str, np.ndarray]) -> str:
+    """Write a predictions file atomically; returns its SHA-256."""
+    return write(path, arrays, header.record())
+
+
+def read_prediction_header(path: Path) -> Header:
+    """The header, every field checked.
+
+    Raises:
+        StoreError: Not a predictions file, a second metadata entry, a missing or wrong field.
+    """
+    try:
+        record = read_header(path, PREDICTIONS)
+        with safe_open(path, "numpy") as file:
+            entries = sorted(file.metadata() or {})
+    except (SafetensorError, OSError, RecursionError, UnicodeError) as error:
+        raise StoreError(
+            f"{path}: expected a safetensors file with a header, found {error}"
+        ) from error
+    if entries != ["scapo"]:
+        raise StoreError(f"{path}: expected the one metadata entry 'scapo', found {entries}")
+    digests = [record[key] for key in DIGEST_KEYS if key in record]
+    if not digests:
+        raise StoreError(f"{path}: header field {DIGEST_KEYS[0]!r}: expected text, found none")
+    seed = record.get("seed")
+    if isinstance(seed, bool) or not isinstance(seed, int) or abs(seed) >= 2**63:
+        raise StoreError(f"{path}: header field 'seed': expected an integer, found {_shown(seed)}")
+    return Header(
+        method=_text(path, record, "method"),
+        variant=_text(path, record, "variant", empty=True),
+        category=_text(path, record, "category"),
+        split=_text(path, record, "split"),
+        seed=seed,
+        data_digest=_text(path, {DIGEST_KEYS[0]: digests[0]}, DIGEST_KEYS[0]),
+        supervision=_supervision(path, record),
+        camera=_camera(path, record),
+        budget=_object(path, record, "budget"),
+        run=_object(path, record, "run"),
+    )
+
+
+def _camera(path: Path, record: dict[str, Any]) -> bool | None:
+    value = record.get("camera")
+    if value is not None and not isinstance(value, bool):
+        raise StoreError(
+            f"{path}: header field 'camera': expected true or false, found {_shown(value)}"
+        )
+    return value
+
+
+def _object(path: Path, record: dict[str, Any], name: str) -> dict[str, Any]:
+    value = record.get(name, {})
+    if not isinstance(value, dict):
+        found = _shown(value)
+        raise StoreError(f"{path}: header field {name!r}: expected an object, found {found}")
+    return value
+
+
+def _shown(value: object) -> str:
+    return "none" if value is None else repr(value)[:LONGEST_NAME]
+
+
+def _text(path: Path, record: dict[str, Any], name: str, *, empty: bool = False) -> str:
+    value = record.get(name)
+    if not isinstance(value, str) or not (value or empty) or not value.isprintable():
+        raise StoreError(f"{path}: header field {name!r}: expected text, found {_shown(value)}")
+    if len(value) > LONGEST_NAME:
+        raise StoreError(
+            f"{path}: header field {name!r}: expected at most {LONGEST_NAME} characters, "
+            f"found {len(value)}"
+        )
+    return value
+
+
+def _supervision(path: Path, record: dict[str, Any]) -> tuple[Supervision, ...]:
+    value, known = record.get("supervision"), get_args(Supervision)
+    if not isinstance(value, list) or any(item not in known for item in value):
+        raise StoreError(
+            f"{path}: header field 'supervision': expected a list of "
+            f"{', '.join(known)}, found {_shown(value)}"
+        )
+    return tuple(sorted(set(value)))
+
+
+def check_belongs(path: Path, header: Header, manifest: Manifest) -> None:
+    """Refuse predictions of another category, split or data set.
+
+    Raises:
+        StoreError: Naming the field.
+    """
+    expected = {
+        "category": manifest.category,
+        "split": manifest.split,
+        "data_digest": manifest.digest,
+    }
+    for name, want in expected.items():
+        have = getattr(header, name)
+        if have != want:
+            raise StoreError(
+                f"{path}: header field {name!r}: expected {want!r} as in the data, found {have!r}"
+            )
+
+
+def find_data(folder: Path, header: Header) -> Split:
+    """The split that a header names, its bytes verified.
+
+    Where several data sets below `folder` have that category and split (the benchmark's `clean`
+    and `sensor` both have laptops), the digest decides.
+
+    Raises:
+        StoreError: Not found, not unique, or changed shards.
+    """
+    pattern = f"*/{header.category}/{header.split}/manifest.json"
+    candidates = [Split(path.parent) for path in sorted(folder.glob(pattern))]
+    fitting = [split for split in candidates if split.manifest.digest == header.data_digest]
+    if len(candidates) > 1 and len(fitting) == 1:
+        found = fitting[0]
+    else:
+        found = open_split(folder, header.category, header.split)
+    found.verify()
+    return found
+
+
+class Predictions:
+    """An open predictions file, read and validated in blocks of samples."""
+
+    def __init__(self, path: Path, split: Split) -> None:
+        """Validate header, names, dtypes and shapes against the data.
+
+        Raises:
+            StoreError: One line naming what was expected and found.
+        """
+        self.path = path
+        self.header = read_prediction_header(path)
+        check_belongs(path, self.header, split.manifest)
+        self.unanswered: dict[str, int] = {}
+        """Samples without an answer so far, by tensor."""
+        self._count = split.manifest.count
+        self._parts = len(split.manifest.parts)
+        self._file = safe_open(path, "numpy")
+        self._slices = check_tensors(str(path), self._file.__enter__(), split)
+
+    def __enter__(self) -> Predictions:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._slices = {}
+        self._file.__exit__(kind, error, trace)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The tensors of the file, sorted."""
+        return tuple(sorted(self._slices))
+
+    def rows(self, first: int, count: int) -> dict[str, np.ndarray]:
+        """The tensors of samples first..first+count-1, checked.
+
+        `part` comes as int16 with -1 for 255.
+
+        Raises:
+            StoreError: A value no answer can have, naming tensor and sample.
+        """
+        out: dict[str, np.ndarray] = {}
+        for name, item in self._slices.items():
+            try:
+                array = item[first : first + count]
+            except SafetensorError as error:
+                raise StoreError(
+                    f"{self.path}: tensor {name!r}: expected readable data, found {error}"
+                ) from error
+            where = f"{self.path}: tensor {name!r}"
+            out[name], missing = check_rows(where, name, array, first, self._parts)
+            self.unanswered[name] = self.unanswered.get(name, 0) + missing
+        return out
+
+    def finish(self) -> None:
+        """After the last block: refuse a tensor in which no sample has an answer.
+
+        Raises:
+            StoreError: Naming the tensor.
+        """
+        for name, missing in self.unanswered.items():
+            if self._count and missing == self._count:
+                raise StoreError(
+                    f"{self.path}: tensor {name!r}: expected an answer for at least "
+                    f"one of {self._count} samples, found NaN in all"
+                )
+
+
+_FLOAT = ("F32",)
+_HALF_OR_FLOAT = ("F16", "F32")
+_NUMBER = ("F16", "F32", "F64")
+
+MAX_VALUES = 1 << 18
+"""Of a tensor's row: a sparse file may say that it holds terabytes."""
+ROTATION_TOLERANCE = 1e-3
+"""Largest entry of R R^T - I and of the last row minus 0 0 0 1."""
+WEIGHT_TOLERANCE = {np.dtype(np.float16): 4e-3, np.dtype(np.float32): 1e-3}
+"""Of the sum of a point's weights; half precision keeps 11 bits of each."""
+
+
+def check_tensors(where: str, file: Any, split: Split) -> dict[str, Any]:  # noqa: ANN401
+    """The slices of an open safetensors file after checking names, dtypes and shapes.
+
+    Raises:
+        StoreError: A tensor is missing, unknown, of another type or shape.
+    """
+    count, n = split.manifest.count, split.manifest.points
+    p, j = len(split.manifest.parts), len(split.manifest.joints)
+    layout: dict[str, tuple[tuple[str, ...], tuple[int | None, ...]]] = {
+        "part": (("U8",), (count, n)),
+        "part_weight": (_HALF_OR_FLOAT, (count, n, p)),
+        "camera_T_part": (_FLOAT, (count, p, 4, 4)),
+        "joint_pivot": (_FLOAT, (count, j, 3)),
+        "joint_axis": (_FLOAT, (count, j, 3)),
+        "joint_state": (_FLOAT, (count, j)),
+        "canonical_points": (_FLOAT, (count, None, 3)),
+        **{f"record_{name}": (_NUMBER, (count, *_record_shape(name, j))) for name in RECORD},
+        "record_expand": (_NUMBER, (count,)),
+        "record_center": (_NUMBER, (count, 3)),
+    }
+    slices: dict[str, Any] = {}
+    for name in file.keys():  # noqa: SIM118 - an open file, not a dict
+        item = file.get_slice(name)
+        expected = layout.get(name)
+        if expected is None and name.startswith("confidence_"):
+            expected = (_HALF_OR_FLOAT, (count, *item.get_shape()[1:]))
+        if expected is None:
+            raise StoreError(
+                f"{where}: expected tensors {', '.join(layout)} or confidence_*, found {name!r}"
+            )
+        _check_tensor(f"{where}: tensor {name!r}", item, *expected)
+        slices[name] = item
+    if ("part" in slices) == ("part_weight" in slices):
+        found = "both" if "part" in slices else f"{', '.join(sorted(slices)) or 'no tensor'}"
+        raise StoreError(
+            f"{where}: expected one of the tensors 'part' and 'part_weight', found {found}"
+        )
+    return slices
+
+
+def _record_shape(name: str, joints: int) -> tuple[int, ...]:
+    if name == "R_select":
+        return (3, 3)
+    if name == "T_select":
+        return (3,)
+    return (joints, 2) if name.endswith("angl") else (joints, 3)
+
+
+def _check_tensor(
+    where: str,
+    item: Any,  # noqa: ANN401
+    dtypes: tuple[str, ...],
+    shape: tuple[int | None, ...],
+) -> None:
+    found, dtype = tuple(item.get_shape()), item.get_dtype()
+    if dtype not in dtypes:
+        raise StoreError(f"{where}: expected dtype {' or '.join(dtypes)}, found {dtype}")
+    fits = len(found) == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, found, strict=True)
+    )
+    if not fits or 0 in found[1:]:
+        wanted = tuple("*" if want is None else want for want in shape)
+        raise StoreError(f"{where}: expected shape {wanted}, found {found}")
+    if math.prod(found[1:]) > MAX_VALUES:
+        raise StoreError(f"{where}: expected at most {MAX_VALUES} values a sample, found {found}")
+
+
+def check_rows(
+    where: str, name: str, array: np.ndarray, first: int, parts: int
+) -> tuple[np.ndarray, int]:
+    """A block of one tensor after checking its values, and how many samples have no answer.
+
+    Args:
+        where: File and tensor, for the message.
+        name: Of the tensor.
+        array: Rows of consecutive samples.
+        first: Index of the first of them, for the message.
+        parts: P.
+
+    Raises:
+        StoreError: A value that no answer can have, naming the sample.
+    """
+    if name == "part":
+        return _check_labels(where, array, first, parts)
+    flat = array.reshape(len(array), -1)
+    missing = np.isnan(flat).all(1)
+    finite = np.isfinite(flat).all(1)
+    _refuse(
+        np.asarray(~(finite | missing)),
+        where,
+        first,
+        "finite values or a row of NaN alone",
+        lambda i: "some NaN" if np.isnan(flat[i]).any() else "an infinite value",
+    )
+    known = np.flatnonzero(finite)
+    if name == "part_weight":
+        _check_weights(where, array, known, first)
+    if name == "camera_T_part":
+        _check_poses(where, array, known, first)
+    return array, int(missing.sum())
+
+
+def _refuse(
+    wrong: Bool[np.ndarray, " B"],
+    where: str,
+    first: int,
+    expected: str,
+    found: Callable[[int], str],
+) -> None:
+    if wrong.any():
+        index = int(wrong.argmax())
+        raise StoreError(
+            f"{where}: sample {first + index}: expected {expected}, found {found(index)}"
+        )
+
+
+def _check_labels(
+    where: str, array: Num[np.ndarray, "B N"], first: int, parts: int
+) -> tuple[np.ndarray, int]:
+    """255 says that the point belongs to no part; a row of nothing else is no answer."""
+    none = array == UNLABELLED
+    outside = (array >= parts) & ~none
+    _refuse(
+        outside.any(1),
+        where,
+        first,
+        f"labels 0..{parts - 1} or {UNLABELLED}",
+        lambda i: str(int(array[i][outside[i]][0])),
+    )
+    part = array.astype(np.int16)
+    part[none] = -1
+    return part, int(none.all(1).sum())
+
+
+def _check_weights(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
+    weights = array.astype(np.float32, copy=False)
+    tolerance = WEIGHT_TOLERANCE[array.dtype]
+    wrong = np.zeros(len(array), bool)
+    total = sum(weights[..., k] for k in range(weights.shape[-1]))
+    lowest = weights.min(axis=(1, 2))
+    wrong[known] = lowest[known] < -tolerance
+    _refuse(wrong, where, first, "weights of 0 or more", lambda i: f"{lowest[i]:.4g}")
+    error = np.abs(total - np.float32(1)).max(1)
+    wrong[known] = error[known] > tolerance
+    _refuse(
+        wrong,
+        where,
+        first,
+        f"weights of a point to sum to 1 within {tolerance}",
+        lambda i: f"an error of {error[i]:.4g}",
+    )
+
+
+def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
+    worst = np.zeros(len(array))
+    worst[known] = rotation_error(array[known][..., :3, :3]).max(1)
+    _refuse(
+        worst > ROTATION_TOLERANCE,
+        where,
+        first,
+        f"rotations with R R^T = I within {ROTATION_TOLERANCE} and det R = 1",
+        lambda i: f"an error of {worst[i]:.4g}" if worst[i] != 2 else "a reflection",
+    )
+    last = np.zeros(len(array))
+    last[known] = np.abs(array[known][..., 3, :] - np.array([0, 0, 0, 1])).max((-1, -2))
+    _refuse(
+        last > ROTATION_TOLERANCE,
+        where,
+        first,
+        "a last row 0 0 0 1",
+        lambda i: f"an error of {last[i]:.4g}",
+    )
