@@ -104,9 +104,7 @@ def complete_config() -> ScapoConfig:
         points=512,
         encoder=replace(lean.encoder, centres=48, neighbours=10, branch=(32, 64, 48, 32)),
         decoder=replace(lean.decoder, points=256),
-        joint=replace(
-            lean.joint, width=32, points=192, base_fixed=False, revolute_range=4.0
-        ),
+        joint=replace(lean.joint, width=32, points=192, base_fixed=False, revolute_range=4.0),
         loss=replace(
             lean.loss,
             recon_form="squared",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stage 2's networks begin at what the search of parts found: regression, before any loss of theirs.
+"""Stage 2's networks begin at what the search of parts found: regression before their losses.
 
 Not in the paper. For some training clouds the search tells how the template lies in them; here that
 becomes what Theta_J, Theta_K and Theta_Delta should say of them, in the aligned frame of stage 1,
@@ -46,9 +46,7 @@ class FirstTargets:
 
 
 def _rows(joints: JointPairs, index: Tensor) -> JointPairs:
-    return JointPairs(
-        pivot=joints.pivot[index], axis=joints.axis[index], state=joints.state[index]
-    )
+    return JointPairs(pivot=joints.pivot[index], axis=joints.axis[index], state=joints.state[index])
 
 
 def first_targets(s: Skeleton, at: Placements, kinds: tuple[JointKind, ...]) -> FirstTargets:
@@ -77,7 +75,9 @@ def first_targets(s: Skeleton, at: Placements, kinds: tuple[JointKind, ...]) -> 
             state=torch.stack([-angle, at.state - angle], -1),
         ),
         template_joints=JointPairs(
-            pivot=pivot_y, axis=axis_y, state=torch.zeros_like(at.state)[..., None].expand(-1, -1, 2)
+            pivot=pivot_y,
+            axis=axis_y,
+            state=torch.zeros_like(at.state)[..., None].expand(-1, -1, 2),
         ),
         residual=s.points * (size - 1),
         keypoints=place,
@@ -97,36 +97,37 @@ def joint_error(said: JointPairs, wanted: JointPairs) -> Float[Tensor, ""]:
 class Inputs:
     """What the networks see of the clouds, constant while the encoder is."""
 
+    template: Float[Tensor, "M 3"]
+    """Y_base."""
     aligned: Float[Tensor, "B N 3"]
     code: Float[Tensor, "B Z"]
     features: Float[Tensor, "B M C"]
 
 
+RATE = 2e-3
+"""Learning rate at the beginning."""
+
+
 @torch.enable_grad()
 def fit_networks(
     networks: tuple[JointNetwork, KeypointNetwork, ResidualNetwork],
-    template: Float[Tensor, "M 3"],
     inputs: Inputs,
     wanted: FirstTargets,
     generator: torch.Generator,
-    *,
     steps: int,
-    rate: float = 2e-3,
 ) -> list[float]:
     """Fit the three networks to the targets; the mean loss of every 50 steps.
 
     Args:
         networks: Theta_J, Theta_K, Theta_Delta.
-        template: Y_base.
         inputs: Of the clouds.
         wanted: Of the same clouds.
         generator: Chooses batches and points.
-        steps: Of Adam, 32 clouds each, the rate on half a cosine.
-        rate: The learning rate it begins with.
+        steps: Of Adam, 32 clouds each, the rate on half a cosine from RATE.
     """
     joints, keypoints, residual = networks
     parameters = trainable(networks)
-    optimizer = torch.optim.Adam(parameters, lr=rate)
+    optimizer = torch.optim.Adam(parameters, lr=RATE)
     count, number = inputs.aligned.shape[:2]
     history: list[float] = []
     for k in range(steps):
@@ -134,7 +135,7 @@ def fit_networks(
         order = torch.randperm(number, generator=generator, device=generator.device)
         want = wanted.rows(index)
         change = residual(inputs.features[index])
-        own, its = joints.pair(inputs.aligned[index][:, order], template + change.detach())
+        own, its = joints.pair(inputs.aligned[index][:, order], inputs.template + change.detach())
         loss = (
             joint_error(own, want.joints)
             + joint_error(its, want.template_joints)
@@ -142,11 +143,11 @@ def fit_networks(
             + (keypoints(inputs.code[index]) - want.keypoints).square().sum(-1).mean()
         )
         for group in optimizer.param_groups:
-            group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * k / steps))
+            group["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * k / steps))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        history.append(float(loss))
+        history.append(float(loss.detach()))
     return [sum(history[k : k + 50]) / 50 for k in range(0, steps - 49, 50)]
 
 

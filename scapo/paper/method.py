@@ -40,7 +40,7 @@ from scapo.paper.heads import (
     thin,
 )
 from scapo.paper.objectives import Explanation, articulation, canonicalisation
-from scapo.paper.part_search import place, search
+from scapo.paper.part_search import PartSearch, motionless
 from scapo.paper.refine import refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
@@ -182,20 +182,25 @@ class Scapo(AbstractMethod):
     ) -> None:
         """Template, bones and networks as the search of parts leaves them."""
         config = self.config.search
-        found, _ = search(aligned[medoid], aligned, self.kinds, config)
+        parts = PartSearch(self.kinds, config)
+        found, _ = parts.search(aligned[medoid], aligned)
         skeleton = found.laid_over(self.template.points)
         some = aligned[: config.taught]
-        at, _ = place(some, found, self.kinds, config, config.placing)
+        at, _ = parts.place(some, found, motionless(some, len(self.kinds)), config.placing)
         self.template.set_to(skeleton.points, skeleton.keypoints)
         self.bones.set_to(skeleton.precision())
         features = [self.decoder(codes)[1] for codes in code[: config.taught].split(64)]
         fit_networks(
             (self.joint_network, self.keypoint_network, self.residual_network),
-            skeleton.points,
-            Inputs(aligned=some, code=code[: config.taught], features=torch.cat(features)),
+            Inputs(
+                template=skeleton.points,
+                aligned=some,
+                code=code[: config.taught],
+                features=torch.cat(features),
+            ),
             first_targets(skeleton, at, self.kinds),
             generator,
-            steps=config.teaching,
+            config.teaching,
         )
 
     def explain(self, points: Float[Tensor, "B N 3"]) -> Explanation:

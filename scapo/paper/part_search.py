@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import farthest_points, gather, nearest
+from scapo.geometry.points import farthest_points, gather, k_means, k_nearest, nearest
 from scapo.geometry.rigid import joint_motion
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.skinning import deform, gaussian_weights
@@ -78,7 +78,7 @@ class Skeleton:
         return self.factor.mT @ self.factor
 
     def weights(self) -> Float[Tensor, "M P"]:
-        """w of the template's points."""
+        """Of the template's points: w."""
         return gaussian_weights(self.points[None], self.keypoints[None], self.precision())[0]
 
     def laid_over(self, shape: Float[Tensor, "K 3"]) -> Skeleton:
@@ -146,34 +146,9 @@ def misfit(
     return (there + 1e-6).sqrt().mean(-1) + (back + 1e-6).sqrt().mean(-1)
 
 
-def _every(
-    points: Float[Tensor, "B N 3"], count: int, offset: int
-) -> Float[Tensor, "B K 3"]:
+def _every(points: Float[Tensor, "B N 3"], count: int, offset: int) -> Float[Tensor, "B K 3"]:
     step = max(1, points.shape[1] // count)
     return points[:, offset % step :: step]
-
-
-@torch.no_grad()
-def with_best_states(
-    clouds: Float[Tensor, "B N 3"], s: Skeleton, at: Placements, kinds: Kinds, c: SearchConfig
-) -> Placements:
-    """Each joint's state replaced where one of seven others fits better."""
-
-    def cost(state: Tensor) -> Tensor:
-        return misfit(clouds, posed(s, replace(at, state=state), kinds), c.asked // 2)
-
-    state = at.state
-    for j, kind in enumerate(kinds):
-        least, best = cost(state), state
-        reach = c.reach if kind == "revolute" else c.reach / 4
-        for value in torch.linspace(-reach, reach, 7).tolist():
-            other = state.clone()
-            other[:, j] = value
-            found = cost(other)
-            best = torch.where((found < least)[:, None], other, best)
-            least = torch.minimum(found, least)
-        state = best
-    return replace(at, state=state)
 
 
 def held(s: Skeleton, at: Placements) -> Float[Tensor, ""]:
@@ -189,59 +164,13 @@ RATES = (0.25, 0.5, 25.0, 0.5, 1.0)
 """Learning rates of a skeleton's fields as multiples of `SearchConfig.rate`."""
 
 
-@torch.enable_grad()
-def fit(
-    clouds: Float[Tensor, "B N 3"], s: Skeleton, kinds: Kinds, c: SearchConfig, steps: int
-) -> Skeleton:
-    """The skeleton after so many steps of Adam on it and on the placements of the clouds."""
-    return _descend(clouds, s, kinds, c, steps, learned=True)[0]
-
-
-def place(
-    clouds: Float[Tensor, "B N 3"], s: Skeleton, kinds: Kinds, c: SearchConfig, steps: int
-) -> tuple[Placements, Float[Tensor, " B"]]:
-    """How the skeleton lies in each cloud, and the misfit that is left."""
-    found, left = [], []
-    for some in clouds.split(64):
-        with torch.enable_grad():
-            at = _descend(some, s, kinds, c, steps, learned=False)[1]
-        with torch.no_grad():
-            left.append(misfit(some, posed(s, at, kinds), 2 * c.asked))
-        found.append(values(at))
-    columns = [torch.cat(column) for column in zip(*found, strict=True)]
-    return having(motionless(clouds, len(kinds)), columns), torch.cat(left)
-
-
-def _descend(
-    clouds: Float[Tensor, "B N 3"],
-    s: Skeleton,
-    kinds: Kinds,
-    c: SearchConfig,
-    steps: int,
-    *,
-    learned: bool,
-) -> tuple[Skeleton, Placements]:
-    """Adam on the placements, and on the skeleton where it is learned."""
-    at = with_best_states(clouds, s, motionless(clouds, len(kinds)), kinds, c)
-    own = [value.clone().requires_grad_() for value in values(at)]
-    common = [value.clone().requires_grad_(learned) for value in values(s)]
-    rates = [c.rate] * len(own) + [c.rate * rate for rate in RATES] * learned
-    learning = own + common * learned
-    groups = [{"params": [one], "lr": rate} for one, rate in zip(learning, rates, strict=True)]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    for k in range(steps):
-        s, at = having(s, common), having(at, own)
-        if k in (steps // 4, steps // 2):
-            own[-1].data.copy_(with_best_states(clouds, s, at, kinds, c).state)
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * 0.1 ** (k / steps)
-        cost = misfit(clouds, posed(s, at, kinds), c.asked, k).mean()
-        cost = cost + 0.05 * at.size.square().mean() + (held(s, at) if learned else 0.0)
-        optimizer.zero_grad()
-        cost.backward()
-        optimizer.step()
-    ended = (having(s, [x.detach() for x in common]), having(at, [x.detach() for x in own]))
-    return ended
+@torch.no_grad()
+def residual(
+    clouds: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"], template: Float[Tensor, "M 3"]
+) -> Float[Tensor, " M"]:
+    """How far each point of the template, as placed, is from the clouds: a mean over neighbours."""
+    gap = (shapes - gather(clouds, nearest(shapes, clouds))).square().sum(-1).sqrt().mean(0)
+    return gap[k_nearest(template, template, 12)].mean(1)
 
 
 def split_skeleton(
@@ -281,51 +210,172 @@ def _main_directions(points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " 3"],
 
 
 def splits(
-    points: Float[Tensor, "M 3"], joints: int, seeds: int
+    points: Float[Tensor, "M 3"], stray: Float[Tensor, " M"], joints: int, seeds: int
 ) -> list[list[Bool[Tensor, " M"]]]:
-    """Which points each child may have: halves and ends along the main directions, and balls."""
+    """Which points each child may have.
+
+    Args:
+        points: Of the template.
+        stray: How far each is from clouds on which the template lies as a whole: what moved is.
+        joints: For one: halves and ends along the main directions, balls, the points that stray
+            most. For two: the two ends of a direction, two balls, and the strays in two clusters.
+        seeds: How many balls.
+    """
     count, least = len(points), len(points) // 5
     ranks = [along.argsort().argsort() for along in (points @ _main_directions(points)[1]).T]
     ends = [[rank < least, rank >= count - least] for rank in ranks]
     first = int((points - points.mean(0)).norm(dim=1).argmax())
     chosen = farthest_points(points, seeds, start=first)
     balls = [row.argsort().argsort() < least for row in torch.cdist(points[chosen], points)]
+    strays = [stray.argsort(descending=True).argsort() < count // k for k in (8, 5, 3)]
     if joints == 1:
         halves = [rank < count // 2 for rank in ranks]
-        return [[some] for some in (*halves, *sum(ends, []), *balls)]
+        return [
+            [some] for some in (*halves, *(end for pair in ends for end in pair), *balls, *strays)
+        ]
     apart = [
         [one, other]
         for i, one in enumerate(balls)
         for other in balls[:i]
         if not bool((one & other).any())
     ]
-    return ends + apart
+    clusters = []
+    for some in strays:
+        corner = farthest_points(points[some], 2)
+        nearer = torch.cdist(points, k_means(points[some], points[some][corner], 20)).argmin(1)
+        clusters.append([some & (nearer == k) for k in (0, 1)])
+    return ends + apart + clusters
 
 
-def search(
-    template: Float[Tensor, "M 3"], clouds: Float[Tensor, "B N 3"], kinds: Kinds, c: SearchConfig
-) -> tuple[Skeleton, list[list[float]]]:
-    """The start that explains clouds best which it was not fitted to.
+Learned = Literal["skeleton", "placements", "rigid"]
 
-    Args:
-        template: A shape of the category in the aligned frame.
-        clouds: Aligned; the first half is fitted, the second judges.
-        kinds: Of the joints.
-        c: How widely.
 
-    Returns:
-        It, and of each round the misfit of every start, rising.
-    """
-    fitted, judging = clouds.chunk(2)
-    chosen = template[torch.arange(c.points, device=template.device) * len(template) // c.points]
-    starts = [
-        split_skeleton(chosen, some, c.spread) for some in splits(chosen, len(kinds), c.seeds)
-    ]
-    said = []
-    for number, steps, kept in zip(c.clouds, c.steps, (*c.kept, 1), strict=True):
-        ends = [fit(fitted[:number], start, kinds, c, steps) for start in starts]
-        left = [place(judging[:number], s, kinds, c, max(20, steps // 3))[1].mean() for s in ends]
-        order = torch.stack(left).argsort().tolist()
-        said.append([float(left[k]) for k in order])
-        starts = [ends[k] for k in order[:kept]]
-    return starts[0], said
+class PartSearch:
+    """Fits and judges skeletons of a category with these joints."""
+
+    def __init__(self, kinds: Kinds, config: SearchConfig) -> None:
+        self.kinds, self.config = kinds, config
+
+    def search(
+        self, template: Float[Tensor, "M 3"], clouds: Float[Tensor, "B N 3"]
+    ) -> tuple[Skeleton, list[list[float]]]:
+        """The start that explains clouds best which it was not fitted to.
+
+        Args:
+            template: A shape of the category in the aligned frame.
+            clouds: Aligned; the first half is fitted, the second judges.
+
+        Returns:
+            It, and of each round the misfit of every start, rising.
+        """
+        c = self.config
+        sides = [half[: c.clouds[-1]] for half in clouds.chunk(2)]
+        number = torch.arange(c.points, device=template.device) * len(template) // c.points
+        starts, at = self.starts(template[number], sides)
+        said = []
+        for count, steps, kept in zip(c.clouds, c.steps, (*c.kept, 1), strict=True):
+            fitted, judged = (having(where, [x[:count] for x in values(where)]) for where in at)
+            ends = [
+                self.descend(sides[0][:count], start, fitted, steps, "skeleton")[0]
+                for start in starts
+            ]
+            few = max(20, steps // 3)
+            left = [self.place(sides[1][:count], s, judged, few)[1].mean() for s in ends]
+            order = torch.stack(left).argsort().tolist()
+            said.append([float(left[k]) for k in order])
+            starts = [ends[k] for k in order[:kept]]
+        return starts[0], said
+
+    def starts(
+        self, points: Float[Tensor, "M 3"], sides: list[Float[Tensor, "B N 3"]]
+    ) -> tuple[list[Skeleton], list[Placements]]:
+        """Skeletons of all splits, and the placements of the template as one rigid body."""
+        c, joints = self.config, len(self.kinds)
+        any_child = points[:, 0] > points[:, 0].mean()
+        whole = split_skeleton(points, [any_child] * joints, c.spread)
+        at = [
+            self.descend(side, whole, motionless(side, joints), c.placing, "rigid")[1]
+            for side in sides
+        ]
+        stray = residual(sides[0], posed(whole, at[0], self.kinds), points)
+        some = splits(points, stray, joints, c.seeds)
+        return [split_skeleton(points, children, c.spread) for children in some], at
+
+    @torch.enable_grad()
+    def descend(
+        self,
+        clouds: Float[Tensor, "B N 3"],
+        s: Skeleton,
+        at: Placements,
+        steps: int,
+        learned: Learned = "placements",
+    ) -> tuple[Skeleton, Placements]:
+        """Adam on the misfit.
+
+        Args:
+            clouds: Aligned frame.
+            s: Skeleton.
+            at: Where the placements begin.
+            steps: How many.
+            learned: `placements`; `skeleton`: that too; `rigid`: placements but for the states.
+        """
+        c, moves, shared = self.config, learned != "rigid", learned == "skeleton"
+        at = self.with_best_states(clouds, s, at) if moves else at
+        own = [value.clone().requires_grad_() for value in values(at)]
+        common = [value.clone().requires_grad_(shared) for value in values(s)]
+        learning = own[: None if moves else -1] + common * shared
+        rates = [c.rate] * (len(learning) - len(RATES) * shared) + [
+            c.rate * rate for rate in RATES
+        ] * shared
+        groups = [{"params": [one], "lr": rate} for one, rate in zip(learning, rates, strict=True)]
+        optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        for k in range(steps):
+            s, at = having(s, common), having(at, own)
+            if moves and k in (steps // 4, steps // 2):
+                own[-1].data.copy_(self.with_best_states(clouds, s, at).state)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * 0.1 ** (k / steps)
+            cost = misfit(clouds, posed(s, at, self.kinds), c.asked, k).mean()
+            cost = cost + 0.05 * at.size.square().mean() + (held(s, at) if shared else 0.0)
+            optimizer.zero_grad()
+            cost.backward()
+            optimizer.step()
+        return having(s, [x.detach() for x in common]), having(at, [x.detach() for x in own])
+
+    @torch.no_grad()
+    def with_best_states(
+        self, clouds: Float[Tensor, "B N 3"], s: Skeleton, at: Placements
+    ) -> Placements:
+        """Each joint's state replaced where one of seven others fits better."""
+
+        def cost(state: Tensor) -> Tensor:
+            shapes = posed(s, replace(at, state=state), self.kinds)
+            return misfit(clouds, shapes, self.config.asked // 2)
+
+        state = at.state
+        for j, kind in enumerate(self.kinds):
+            least, best = cost(state), state
+            reach = self.config.reach if kind == "revolute" else self.config.reach / 4
+            for value in torch.linspace(-reach, reach, 7).tolist():
+                other = state.clone()
+                other[:, j] = value
+                found = cost(other)
+                best = torch.where((found < least)[:, None], other, best)
+                least = torch.minimum(found, least)
+            state = best
+        return replace(at, state=state)
+
+    def place(
+        self, clouds: Float[Tensor, "B N 3"], s: Skeleton, at: Placements, steps: int
+    ) -> tuple[Placements, Float[Tensor, " B"]]:
+        """How the skeleton lies in each cloud, and the misfit that is left."""
+        found, left = [], []
+        for rows in torch.arange(len(clouds), device=clouds.device).split(64):
+            begin = having(at, [value[rows] for value in values(at)])
+            _, end = self.descend(clouds[rows], s, begin, steps)
+            with torch.no_grad():
+                shapes = posed(s, end, self.kinds)
+                left.append(misfit(clouds[rows], shapes, 2 * self.config.asked))
+            found.append(values(end))
+        every = [torch.cat(column) for column in zip(*found, strict=True)]
+        return having(at, every), torch.cat(left)
