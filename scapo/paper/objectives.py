@@ -275,9 +275,10 @@ def joint_terms(
         "joint_prox": lambda: sum_of(
             losses.joint_proximity(
                 pivot,
-                points.detach() if config.proximity_detach else points,
+                points,
                 config.proximity_scale,
                 config.proximity_neighbours,
+                detach=config.proximity_detach,
             )
             for pivot, points in ((x.pivot, d.canonical), (y.pivot, e.template))
         ),
