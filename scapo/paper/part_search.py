@@ -57,7 +57,7 @@ class SearchConfig:
     taught: int = 1000
     """Clouds that are placed, for the networks to be fitted to."""
     placing: int = 40
-    """Steps of Adam for that."""
+    """Steps of Adam for that; where starts are judged, half of them or a third of the round's."""
     teaching: int = 400
     """Steps of Adam of the networks."""
 
@@ -279,7 +279,7 @@ class PartSearch:
                 self.descend(sides[0][:count], start, fitted, steps, "skeleton")[0]
                 for start in starts
             ]
-            few = max(20, steps // 3)
+            few = max(c.placing // 2, steps // 3)
             left = [self.place(sides[1][:count], s, judged, few)[1].mean() for s in ends]
             order = torch.stack(left).argsort().tolist()
             said.append([float(left[k]) for k in order])

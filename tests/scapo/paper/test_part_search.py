@@ -107,8 +107,17 @@ def test_points_that_stray_are_tried_together() -> None:
 
 
 def test_a_skeleton_is_laid_over_a_shape_point_by_point() -> None:
-    clouds, _ = hinged(torch.tensor([1.0]))
-    search_config = replace(CONFIG, clouds=(1,), kept=(), steps=(1,))
-    found, _ = PartSearch(("revolute",), search_config).search(clouds[0], clouds.expand(2, -1, -1))
-    shape = found.points[torch.randperm(160, generator=generator(3))[:60]] + 1e-4
-    assert_close(found.laid_over(shape).points, shape, atol=1e-3, rtol=0)
+    clouds, part = hinged(torch.tensor([1.0]))
+    whole = split_skeleton(clouds[0], [part[0] == 1], CONFIG.spread)
+    shape = whole.points[torch.randperm(200, generator=generator(3))[:60]] + 1e-4
+    assert_close(whole.laid_over(shape).points, shape, atol=1e-3, rtol=0)
+
+
+def test_every_round_says_what_its_starts_left() -> None:
+    clouds, _ = hinged(torch.tensor([0.6, 1.0, 1.4, 1.8]))
+    brief = replace(
+        CONFIG, seeds=1, clouds=(1, 2), kept=(2,), steps=(1, 1), points=60, asked=60, placing=1
+    )
+    _, said = PartSearch(("revolute",), brief).search(clouds[0], clouds)
+    assert [len(row) for row in said] == [13, 2]
+    assert all(row == sorted(row) for row in said)
