@@ -75,7 +75,12 @@ LIBRARY: dict[str, Method] = {
         title="SCAPO",
         rank=70,
         maker="scapo.paper.method:Scapo",
-        presets={"paper": "scapo.paper.method:ScapoConfig", "cpu": "scapo.paper.method:cpu_config"},
+        presets={
+            "paper": "scapo.paper.config:ScapoConfig",
+            "literal": "scapo.paper.config:literal_config",
+            "cpu": "scapo.paper.config:cpu_config",
+            "complete": "scapo.paper.config:complete_config",
+        },
     ),
     "registered": Method(
         title="SCAPO, registered",

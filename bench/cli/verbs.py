@@ -251,6 +251,29 @@ class Calibrate(requests.CalibrateRequest):
             say(console, f"Written: {path}")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demo(requests.DemoRequest):
+    """A local page where a file is dropped and what infer makes of it appears."""
+
+    def run(self, console: Console) -> None:
+        """Serve until Ctrl-C."""
+        from bench.infer.server import serve
+
+        serve(self, lambda line: say(console, line))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Release(requests.ReleaseRequest):
+    """Make a small checkpoint of a finished run, with its card, for scapo.load and infer."""
+
+    def run(self, console: Console) -> None:
+        """Write them, and say how large the model is."""
+        from bench.runs.release import release
+
+        for path in release(self):
+            say(console, f"{path}: {path.stat().st_size:,} bytes")
+
+
 VERBS: dict[str, Any] = {
     "train": Train[tuple[()]],
     "predict": Predict,
@@ -262,8 +285,10 @@ VERBS: dict[str, Any] = {
     "study": Study,
     "reference": Reference,
     "run": Run,
+    "release": Release,
     "infer": Infer,
     "calibrate": Calibrate,
+    "demo": Demo,
 }
 """In the order of the help, where `train` stands without its methods."""
 

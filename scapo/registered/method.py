@@ -64,7 +64,6 @@ from scapo.registered.pseudo_labels import PseudoLabels
 from scapo.registered.template import (
     ArticulatedTemplate,
     Placement,
-    slides,
     turn_placement,
 )
 from scapo.registered.view_bank import ShownPoints, ViewBank
@@ -249,6 +248,10 @@ class AbstractRegistered(AbstractMethod):
         self.pseudo.set(key, placement, camera, trust)
         self.pseudo.show(ShownPoints.of(views))
 
+    def strip(self) -> None:
+        """Keep of the training clouds what `quick` and `refine` look at: those placed surely."""
+        self.pseudo.keep_trusted()
+
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`vote_losses`)."""
         del labels
@@ -319,7 +322,7 @@ class AbstractRegistered(AbstractMethod):
             translation=(frames.mT @ translation[..., None])[..., 0],
             log_scale=votes.log_scale,
             state=votes.state,
-            shift=votes.shift * slides(self.template),
+            shift=votes.shift,
             deviation=torch.zeros_like(votes.shift),
         )
         return placement, (votes, weight.mean(1).view(count, FRAMES))
