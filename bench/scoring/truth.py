@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError, safe_open
 
-from scapo.categories import CATEGORIES
 from scapo.store import SAMPLES, Split, StoreError, read_header
+from scapo.store.definitions import known_category
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
 
@@ -71,7 +71,7 @@ class Truth:
 
 def symmetry(manifest: Manifest) -> Float[np.ndarray, "3 3"] | None:
     """The rotation of the object frame that exchanges the parts, None where there is none."""
-    known = CATEGORIES.get(manifest.category)
+    known = known_category(manifest)
     if known is None or known.symmetry is None:
         return None
     return np.array(known.symmetry, np.float64)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from scapo.method import AbstractMethod
 from scapo.store import checkpoint, provenance
+from scapo.store.definitions import definition
 from scapo.store.files import (
     Arrays,
     Header,
@@ -95,6 +96,7 @@ class RunFolder:
         """What checkpoint and config.json say."""
         extra: dict[str, Any] = {
             **self.about,
+            **definition(self.method.category),
             "supervision": sorted(self.method.supervision),
             "parameters": sum(item.numel() for item in self.method.parameters()),
             "steps": position.step,
