@@ -10,9 +10,6 @@ the first: data and finished runs stay.
 from __future__ import annotations
 
 import csv
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -25,16 +22,13 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.figures.pictures import predictions_picture, training_curve
+from bench.grid.command import Program, StepError, run_command
 from scapo import store
 
 CALIBRATED = ("scapo", "registered")
 """Methods that learn without poses: the evaluator fits their part frames on training clouds."""
 PRINTED = ("SCAPO", "ICP")
 PICTURED = 8
-
-
-class StepError(RuntimeError):
-    """A command of the demo failed; the message names it and its log."""
 
 
 @dataclass(frozen=True)
@@ -183,37 +177,22 @@ class Steps:
 
     def data(self, *arguments: str) -> None:
         """A `scapo-data` command."""
-        self._run("scapo-data", "sim_assets", arguments)
+        self._run("scapo-data", arguments)
 
     def bench(self, *arguments: str) -> None:
         """A `scapo-bench` command."""
-        self._run("scapo-bench", "bench", arguments)
+        self._run("scapo-bench", arguments)
 
-    def _run(self, program: str, module: str, arguments: tuple[str, ...]) -> None:
-        """Run, and fail with the last line of the log.
+    def _run(self, program: Program, arguments: tuple[str, ...]) -> None:
+        """Run, and say how long it took.
 
         Raises:
             StepError: The command ended with another status than 0.
         """
         self.number += 1
         log = self.out / "logs" / f"{self.category}-{self.number:02}-{arguments[0]}.txt"
-        log.parent.mkdir(parents=True, exist_ok=True)
-        started = time.perf_counter()
-        environment = {"OMP_NUM_THREADS": "1", **os.environ}
-        with log.open("w") as file:
-            code = subprocess.run(
-                [sys.executable, "-m", module, *arguments],
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                stdin=subprocess.DEVNULL,
-                env=environment,
-                check=False,
-            ).returncode
-        seconds = time.perf_counter() - started
+        seconds = run_command(program, arguments, log)
         self.console.print(f"{seconds:6.1f} s  {program} {' '.join(arguments)}", soft_wrap=True)
-        if code != 0:
-            lines = log.read_text().strip().splitlines() or ["no output"]
-            raise StepError(f"{program} {arguments[0]} ended {code}: {lines[-1]} (log: {log})")
 
 
 def closing_words(demo: Demo, seconds: float) -> str:

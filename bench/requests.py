@@ -242,3 +242,110 @@ class TrainRequest(Generic[M]):
     """Seconds after which the end of an epoch draws pictures, as does the end of a stage."""
     pictures: bool = True
     """Draw pictures at all."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridRequest:
+    """Which grid is run, on what, and how."""
+
+    preset: tyro.conf.Positional[Literal["smoke", "cpu", "paper"]]
+    """smoke: three methods on a few ovens, under three minutes; cpu: every table with the lean
+    presets; paper: with the published sizes, for GPUs."""
+    out: Path
+    """Folder for plan.json, runs/, predictions/, scores/, tables/ and jobs/ (records and logs)."""
+    data: Path | None = None
+    """Folder of the data, PART/CATEGORY/SPLIT; by default OUT/data. What is missing is made by
+    scapo-data."""
+    only: tuple[str, ...] = ()
+    """Only these trainings: patterns of parts, categories, methods or seeds (clean, oven, scapo*,
+    seed1), or several joined by /, such as clean/registered."""
+    splits: tuple[str, ...] = ()
+    """Splits to score, such as val while a method is being made; by default test and test-ood."""
+    budget_minutes: float | None = None
+    """Time of each training on one core, which bounds its epochs; by default the preset's."""
+    real: Path | None = None
+    """Real models of yours, PATH/CATEGORY/ID/*.urdf, to be scored too."""
+    engine: Literal["local", "ray"] = "local"
+    """Where trainings run: on this machine, or on the Ray cluster of RAY_ADDRESS, whose machines
+    all see OUT under the same name."""
+    workers: int | None = None
+    """Trainings at a time; by default one per core, or one where there is a GPU."""
+    gpus: float = 0.0
+    """GPUs of each training: what Ray is asked for. From 2 on a training runs as so many processes
+    of torchrun."""
+    plan_only: bool = False
+    """Write plan.json, show what it comes to, and stop."""
+    replan: bool = False
+    """Write plan.json anew where it differs; what is finished and still the same stays."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelRequest:
+    """Which model answers, and how."""
+
+    checkpoint: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
+    """Run folder or checkpoint of the model."""
+    category: str | None = None
+    """Category whose released model answers. With neither, every released model is asked, and the
+    one whose shape explains the view best is taken."""
+    mode: Mode = "refine"
+    """fast: networks only; refine: with optimisation at test time; quick: with a little of it."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InferRequest(ModelRequest):
+    """Somebody's files, and what they do not say themselves."""
+
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="INPUT...")]
+    """Clouds (.ply, .pcd, .npz with points [, color, sensor]), depth images (.png, .tif) and
+    folders of these."""
+    out: Path
+    """Folder for the results, in OUT/NAME/ for each input NAME.ply."""
+    mask: Path | None = None
+    """Image that is not 0 where a depth image shows the object; else NAME.mask.png beside it, else
+    the nearest thing that is neither floor nor wall is taken."""
+    intrinsics: str | None = None
+    """Camera of a depth image: fx,fy,cx,cy in pixels, or a JSON or YAML file; else NAME.json,
+    NAME.yaml, intrinsics.json or intrinsics.yaml beside it."""
+    scale: float | None = None
+    """Metres in one unit of the input; by default 0.001 for images of whole numbers, else 1."""
+    sensor: tuple[float, float, float] | None = None
+    """Centre of the camera in metres, for clouds in another frame than the camera's."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateRequest:
+    """A model, and the labelled clouds that it is compared with."""
+
+    checkpoint: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, checkpoint, or category with a released model."""
+    data: Path
+    """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
+    split: str = "val"
+    """Labelled split, which the model was not trained on and is not scored on."""
+    mode: Mode = "refine"
+    """Inference mode that is calibrated, each for itself."""
+    limit: int | None = 300
+    """Samples, evenly spread over the split, each asked six times."""
+    picture: Path | None = None
+    """Reliability diagram, FILE.png."""
+    device: str = "auto"
+    """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoRequest(ModelRequest):
+    """Where the page is served, and what it takes."""
+
+    port: int = 8000
+    """Port of the page."""
+    host: str = "127.0.0.1"
+    """Address that is listened at; 0.0.0.0 lets other machines in."""
+    max_upload: int = 64
+    """Megabytes of an upload."""
+    queue: int = 64
+    """Uploads that may wait; more are sent away."""
+    keep: int = 100
+    """Results that are kept."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import torch
@@ -51,14 +52,21 @@ class Predictor:
 
         Raises:
             ValueError: Another shape, no cloud, fewer points than the method needs, values that
-                are not finite.
+                are not finite, another mode.
         """
+        if mode not in get_args(Mode):
+            raise ValueError(f"mode: expected one of {', '.join(get_args(Mode))}, found {mode!r}")
         cloud, least = self._tensor(points), self.model.least_points
         short = cloud.ndim < 2 or cloud.shape[-1] != 3 or cloud.shape[-2] < least
         if short or cloud.numel() == 0:
             raise ValueError(
                 f"points: expected shape (..., N, 3) with N at least {least} and at least one "
                 f"cloud, found {tuple(cloud.shape)}"
+            )
+        if lost := int((~torch.isfinite(cloud).all(-1)).sum()):
+            raise ValueError(
+                f"points: expected finite coordinates, found NaN or infinity in {lost:,} of "
+                f"{cloud[..., 0].numel():,} points; leave those out"
             )
         shape = cloud.shape[:-2]
         centre = None if sensor is None else self._tensor(sensor).expand(*shape, 3).reshape(-1, 3)
@@ -103,13 +111,18 @@ def find(path_or_category: str | Path) -> Path:
     path = Path(path_or_category)
     if path.exists():
         return path
-    released = Path(str(files("scapo"))) / RELEASED
-    if str(path_or_category) in CATEGORIES:
-        path = released / f"{path_or_category}.safetensors"
-        if path.is_file():
-            return path
-    known = ", ".join(sorted(item.stem for item in released.glob("*.safetensors"))) or "none yet"
+    weights = released()
+    if str(path_or_category) in weights:
+        return weights[str(path_or_category)]
+    known = ", ".join(weights) or "none yet"
     raise StoreError(
         f"{path_or_category}: expected a run folder, a checkpoint or a category with released "
         f"weights ({known}), found none"
     )
+
+
+def released() -> dict[str, Path]:
+    """Checkpoints that come with the package, by category."""
+    folder = Path(str(files("scapo"))) / RELEASED
+    found = sorted(folder.glob("*.safetensors"))
+    return {path.stem: path for path in found if path.stem in CATEGORIES}

@@ -99,6 +99,12 @@ class Prediction:
     """Camera frame."""
     canonical_points: Float[Tensor, "*B M 3"] | None = None
     """The object in the method's canonical frame and state, metres."""
+    canonical_normals: Float[Tensor, "*B M 3"] | None = None
+    """Of `canonical_points`, unit, outwards."""
+    canonical_part: Int[Tensor, "*B M"] | None = None
+    """Of `canonical_points`: `camera_T_part` of its part takes a point to where it is observed."""
+    joint_limits: Float[Tensor, "*B J 2"] | None = None
+    """Lowest and highest state that the method knows of, as `joints.state`."""
     confidence: Float[Tensor, "*B"] | None = None
     record: Mapping[str, Tensor] | None = None
     """Network-side quantities that a published evaluator needs, by its names, batch first."""

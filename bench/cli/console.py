@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from rich.console import Console
+from rich.live import Live
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
@@ -24,6 +27,8 @@ from rich.text import Text
 from scapo.text import one_line
 
 if TYPE_CHECKING:
+    from bench.grid.execute import Ended
+    from bench.grid.run import Status
     from scapo.training.fit import Progress as Position
 
 Item = TypeVar("Item")
@@ -83,6 +88,62 @@ def summary_table(report: dict[str, Any]) -> Table:
             str(row["undefined"]),
         )
     return table
+
+
+SHOWN = 12
+"""Trainings of a grid that are shown at a time."""
+
+
+@contextmanager
+def shown(console: Console, status: Status) -> Iterator[None]:
+    """A table of what a grid does now, renewed each second where the console is a terminal."""
+    if not console.is_terminal:
+        yield
+        return
+    with Live(get_renderable=lambda: grid_table(status), console=console, refresh_per_second=1):
+        yield
+
+
+def grid_table(status: Status) -> Table:
+    """What goes on now, how much is over and when all will be."""
+    from bench.grid.execute import State
+
+    counts, left = status.counts, status.seconds_left()
+    words = [f"{counts[one]} {one}" for one in get_args(State) if counts[one]]
+    known = {chain.name: chain for chain in status.chains}
+    title = f"{len(status.running)} of {len(status.chains)} trainings at work"
+    caption = f"steps: {', '.join(words) or 'none over'}; {in_words(*left)} left"
+    table = Table("training", "step", "for", "of about", title=title, caption=caption)
+    for name, (step, began) in list(status.running.items())[:SHOWN]:
+        asked = next((one for one in known[name].steps if one.name == step), None)
+        about = None if asked is None else status.estimate.of(known[name], asked)
+        table.add_row(Text(name), Text(step), clock(time.monotonic() - began),
+                      "–" if about is None else clock(about))  # fmt: skip
+    return table
+
+
+def chain_line(name: str, ended: Sequence[Ended]) -> Text:
+    """How a training and what is made of it ended."""
+    counts = Counter(one.state for one in ended)
+    words = ", ".join(f"{count} {state}" for state, count in counts.items())
+    took = clock(sum(one.seconds for one in ended if one.state == "made"))
+    return Text(one_line(f"{name}: {words}, {took}"), style="red" if counts["failed"] else "")
+
+
+def in_words(seconds: float, unknown: int) -> str:
+    """An estimate, and what it leaves out."""
+    return f"about {clock(seconds)}{f' and {unknown} steps nobody has timed' if unknown else ''}"
+
+
+def clock(seconds: float) -> str:
+    """Hours and minutes, or minutes and seconds.
+
+    >>> clock(3725), clock(65)
+    ('1 h 02 min', '1 min 05 s')
+    """
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s"
 
 
 TITLES = {"none": "not moved", "rotation": "turned", "translation": "shifted", "both": "both"}

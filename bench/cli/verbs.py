@@ -15,7 +15,16 @@ import tyro
 from rich.console import Console
 
 from bench import requests
-from bench.cli.console import say, stability_tables, stage_bars, summary_table, watched
+from bench.cli.console import (
+    chain_line,
+    in_words,
+    say,
+    shown,
+    stability_tables,
+    stage_bars,
+    summary_table,
+    watched,
+)
 from bench.metrics import ApRule
 
 
@@ -81,6 +90,8 @@ class Tables:
     """Split of all tables but 6, which has test-ood beside it."""
     ap_rule: ApRule = "mean"
     """How the parts of a sample join in the average precision of Table 2."""
+    html: bool = False
+    """Also write index.html: the tables as a leaderboard that a browser opens from disk."""
     check_paper: bool = False
     """Only list what does not add up in the paper's printed tables; writes nothing."""
 
@@ -92,7 +103,7 @@ class Tables:
         lines = (
             check()
             if self.check_paper
-            else make_tables(self.scores, self.out, self.ap_rule, self.split)
+            else make_tables(self.scores, self.out, self.ap_rule, self.split, page=self.html)
         )
         for line in lines:
             say(console, line)
@@ -162,6 +173,84 @@ class Reference(requests.ReferenceRequest):
             say(console, path)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run(requests.GridRequest):
+    """Run the benchmark: methods x categories x seeds, and the tables of their scores.
+
+    Goes on where it was interrupted or killed. Each command has its log in OUT/jobs; one that fails
+    costs what depends on it alone.
+    """
+
+    def run(self, console: Console) -> None:
+        """Show plan and estimate, do what is left, and name what failed."""
+        from bench.grid.run import Grid
+
+        grid = Grid(self)
+        plan, chains = grid.plan(lambda line: say(console, line))
+        status = grid.status(plan, chains)
+        say(console, f"{len(chains)} trainings, {len(status.estimate.left)} of "
+            f"{sum(len(one.steps) for one in plan.chains)} steps of the plan are left; these take "
+            f"{in_words(*status.seconds_left())} with {status.workers} at a time")  # fmt: skip
+        if self.plan_only:
+            return
+        with shown(console, status):
+            for name, ended in grid.go(plan, status):
+                console.print(chain_line(name, ended), soft_wrap=True)
+        failed = status.failed
+        for one in failed:
+            say(console, f"failed: {one.chain}: {one.reason}")
+        for path in grid.tables(plan):
+            say(console, path)
+        if failed:
+            raise RuntimeError(f"run: expected every step to end well, found {len(failed)} that "
+                               "failed; the same command tries them again")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Infer(requests.InferRequest):
+    """Parts and joints of the object in somebody's cloud or depth image, with a moving twin."""
+
+    def run(self, console: Console) -> None:
+        """Answer each input, a line for each; fail at the end where any failed.
+
+        Raises:
+            ValueError: How many failed, or what was wrong with the only one.
+        """
+        from bench.infer.infer import Done, infer, summary
+
+        single = len(self.inputs) == 1 and not any(path.is_dir() for path in self.inputs)
+
+        def tell(done: Done) -> None:
+            if not (single and done.error):
+                say(Console(stderr=True) if done.error else console, summary(done))
+
+        done = infer(self, tell)
+        failed = [one for one in done if one.error]
+        if failed and single:
+            raise ValueError(failed[0].error)
+        if failed:
+            raise ValueError(f"expected {len(done)} answers, found {len(done) - len(failed)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibrate(requests.CalibrateRequest):
+    """Learn from labelled clouds how far answers of infer are to be trusted, and which way is up.
+
+    Written beside the checkpoint, where infer finds it.
+    """
+
+    def run(self, console: Console) -> None:
+        """Ask, fit and write; say how often answers were right, and how true the confidences."""
+        from bench.infer.calibrate import calibrate
+
+        found, written = calibrate(self, watched(console, "calibrate"))
+        for kind, one in found.reliability.items():
+            off = f"confidences off by {100 * one.error:.1f} % on other objects"
+            say(console, f"{kind}: {100 * one.base_rate:.0f} % right; {off}")
+        for path in written:
+            say(console, f"Written: {path}")
+
+
 VERBS: dict[str, Any] = {
     "train": Train[tuple[()]],
     "predict": Predict,
@@ -172,6 +261,9 @@ VERBS: dict[str, Any] = {
     "pictures": Pictures,
     "study": Study,
     "reference": Reference,
+    "run": Run,
+    "infer": Infer,
+    "calibrate": Calibrate,
 }
 """In the order of the help, where `train` stands without its methods."""
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from bench.metrics import ApRule
 from bench.tables.actuation import load_actuations, table_7
+from bench.tables.leaderboard import PAGE, to_html
 from bench.tables.means import table_1, table_4, table_5, table_6
 from bench.tables.model import Block, Cell, Row, Table, mark_best
 from bench.tables.paper import MEAN, Cells, mean_mismatches, printed_cells
@@ -41,9 +42,21 @@ def build(results: Results, rule: ApRule = "mean") -> tuple[Table, ...]:
 
 
 def make_tables(
-    scores: Path, out: Path, rule: ApRule = "mean", split: str = TABLE_SPLIT
+    scores: Path,
+    out: Path,
+    rule: ApRule = "mean",
+    split: str = TABLE_SPLIT,
+    *,
+    page: bool = False,
 ) -> list[Path]:
     """Write `tableNUMBER.{md,csv,tex}` of all tables and `significance.csv` from scores.
+
+    Args:
+        scores: Folder that is searched for them.
+        out: Folder for the tables.
+        rule: Of the average precision.
+        split: Of all tables but 6.
+        page: Also write the leaderboard, `index.html`.
 
     Returns:
         Their paths.
@@ -53,12 +66,15 @@ def make_tables(
     """
     results = load(scores, split)
     written: dict[Path, str] = {}
-    for table in (*build(results, rule), table_7(load_actuations(scores, split))):
+    tables = (*build(results, rule), table_7(load_actuations(scores, split)))
+    for table in tables:
         stem = f"table{table.number}"
         written[out / f"{stem}.md"] = to_markdown(table)
         written[out / f"{stem}.csv"] = to_csv(table)
         written[out / f"{stem}.tex"] = to_latex(table)
     written[out / "significance.csv"] = significance_csv(results, rule)
+    if page:
+        written[out / PAGE] = to_html(tables, results, scores, out)
     for path, text in written.items():
         write_bytes(path, text.encode())
     return list(written)

@@ -46,7 +46,7 @@ MISSING = "engine ray: expected the package ray (pip install 'scapo[cluster]'), 
 
 
 def open_pool(
-    engine: Engine, workers: int | None = None, *, timeout: float = 300.0
+    engine: Engine, workers: int | None = None, *, timeout: float = 300.0, gpus: float = 0.0
 ) -> AbstractPool[Any, Any]:
     """The pool of an engine.
 
@@ -54,12 +54,13 @@ def open_pool(
         engine: Where the jobs run.
         workers: Jobs at once; None for one per core, of this machine or of the cluster.
         timeout: Seconds without a sign of life after which a job counts as hung.
+        gpus: Of each job on a cluster, which are then all that it sees.
 
     Raises:
         ValueError: `workers` is out of range.
     """
     if engine == "ray":
-        return RayPool(workers, timeout=timeout)
+        return RayPool(workers, timeout=timeout, gpus=gpus)
     return Pool(os.cpu_count() or 1 if workers is None else workers, timeout=timeout)
 
 
@@ -94,14 +95,17 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
     Connects to the cluster that RAY_ADDRESS names, else to one that runs on this machine, else
     starts one here. Every node needs this package in the same version. Args of the constructor:
     `workers` jobs at once at most, None for as many as the cluster has cores; `timeout` as for
-    `Pool`.
+    `Pool`; `gpus` of each job, which sees these alone.
     """
 
-    def __init__(self, workers: int | None = None, *, timeout: float = 300.0) -> None:
+    def __init__(
+        self, workers: int | None = None, *, timeout: float = 300.0, gpus: float = 0.0
+    ) -> None:
         if workers is not None and workers < 1:
             raise ValueError(f"workers: expected 1 or more with engine ray, found {workers}")
         self.workers = workers
         self.timeout = timeout
+        self.gpus = gpus
         self.lost = 0
         """Jobs that were done again because their machine was lost."""
         self._ray: Any = None
@@ -136,7 +140,7 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
     ) -> Iterator[Outcome[Job, Result]]:
         """See `AbstractPool.run`; the amounts of a lost attempt are reported back as negative."""
         waiting = deque(_Attempt(job=job) for job in jobs)
-        task = _task(self._ray)
+        task = _task(self._ray, self.gpus)
         try:
             while waiting or self._running:
                 while waiting and len(self._running) < self._slots():
@@ -209,9 +213,9 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
         return None
 
 
-def _task(ray: Any) -> Any:  # noqa: ANN401
+def _task(ray: Any, gpus: float) -> Any:  # noqa: ANN401
     """The remote function; a lambda, since wrappers that check calls hide what is a generator."""
-    options = {"num_cpus": 1, "max_retries": 0, "num_returns": "streaming"}
+    options = {"num_cpus": 1, "num_gpus": gpus, "max_retries": 0, "num_returns": "streaming"}
     return ray.remote(**options)(lambda *job: (yield from _supervise(*job)))
 
 
@@ -243,8 +247,12 @@ def _connect(ray: Any) -> None:  # noqa: ANN401
 
 
 @lru_cache(maxsize=4)
-def _pool(timeout: float) -> Pool[Any, Any]:
-    """The process beside this Ray worker, kept from task to task; it ends with the worker."""
+def _pool(timeout: float, gpus: str) -> Pool[Any, Any]:
+    """The process beside this Ray worker, kept from task to task; it ends with the worker.
+
+    One for each set of `gpus` (CUDA_VISIBLE_DEVICES), which it takes over when it starts.
+    """
+    del gpus
     return Pool(1, timeout=timeout)
 
 
@@ -282,7 +290,11 @@ def _do(
 ) -> None:
     """Do the job in the process beside this one; messages: (label, amount), then the outcome."""
     try:
-        pool, heard = _pool(timeout), lambda _, label, amount: messages.put((label, amount))
+        pool = _pool(timeout, os.environ.get("CUDA_VISIBLE_DEVICES", ""))
+
+        def heard(_: Any, label: str, amount: int) -> None:  # noqa: ANN401
+            messages.put((label, amount))
+
         for outcome in pool.run(function, [job], heard, within=within):
             messages.put(outcome)
     except Exception as error:  # noqa: BLE001 - told instead of an endless wait

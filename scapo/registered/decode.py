@@ -11,6 +11,7 @@ from torch import Tensor
 
 from scapo.geometry.points import Similarity, k_nearest
 from scapo.geometry.rigid import rigid
+from scapo.registered.joint_limits import JointLimits
 from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
 from scapo.registered.views import surface_normals
 from scapo.types import Joints, Prediction
@@ -45,14 +46,27 @@ def placed_prediction(
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]
     state = torch.where(slides(template)[:, 0] > 0, metric, placement.state - template.rest)
+    shape, normals = canonical_surface(template, placement)
+    part = template.logit.argmax(-1)
     return Prediction(
         part_weight=part_weight,
         camera_T_part=similarity.inverse_pose(rigid(poses.rotation, move)),
         joints=Joints(pivot=similarity.inverse(pivot), axis=axis, state=state),
-        canonical_points=(canonical_points(template, placement) - origin[:, None])
-        / similarity.scale[:, None, None],
+        canonical_points=(shape - origin[:, None]) / similarity.scale[:, None, None],
+        canonical_normals=normals,
+        canonical_part=part.expand(len(shape), -1),
         confidence=confidence,
     )
+
+
+@torch.no_grad()
+def metric_limits(
+    template: ArticulatedTemplate, limits: JointLimits, similarity: Similarity
+) -> Float[Tensor, "B J 2"]:
+    """Joint limits in the units and from the zero of the predicted states."""
+    ends = torch.stack([limits.low, limits.high], -1)
+    metric = ends / similarity.scale[:, None, None]
+    return torch.where(slides(template) > 0, metric, ends - template.rest[:, None])
 
 
 def _from_rest(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
@@ -75,14 +89,19 @@ def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
 
 
 @torch.no_grad()
-def canonical_points(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B M 3"]:
-    """The template in each cloud's size and the template's frame, in the state that counts as 0."""
+def canonical_surface(
+    template: ArticulatedTemplate, placement: Placement
+) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]]:
+    """Points and normals of the template in each cloud's size, at the state that counts as 0.
+
+    They are in the template's frame.
+    """
     still = replace(
         _at_rest(template, placement),
         rotation=torch.eye(3).to(placement.rotation).expand_as(placement.rotation),
         translation=torch.zeros_like(placement.translation),
     )
-    return template.place(still)[0]
+    return template.place(still)
 
 
 @torch.no_grad()

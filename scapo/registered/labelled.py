@@ -27,7 +27,7 @@ from scapo.categories import JointKind
 from scapo.geometry.points import Similarity, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.records import take
-from scapo.registered.decode import canonical_points, placed_prediction
+from scapo.registered.decode import canonical_surface, placed_prediction
 from scapo.registered.discovery import Discovery
 from scapo.registered.method import AbstractRegistered, LearnedClouds, SearchConfig
 from scapo.registered.pose_refinement import BACKWARD, RANKED
@@ -105,7 +105,7 @@ class LabelledRegistered(AbstractRegistered):
         return replace(
             plain,
             camera_T_part=similarity.inverse_pose(rigid(poses.rotation, poses.translation)),
-            canonical_points=canonical_points(self.template, placement) / scale,
+            canonical_points=canonical_surface(self.template, placement)[0] / scale,
         )
 
 

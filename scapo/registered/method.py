@@ -17,7 +17,7 @@ it.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 import torch
@@ -33,7 +33,7 @@ from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import DiscoveryConfig, TemplateConfig
-from scapo.registered.decode import nearest_weights, placed_prediction
+from scapo.registered.decode import metric_limits, nearest_weights, placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
@@ -344,7 +344,7 @@ class AbstractRegistered(AbstractMethod):
             kept = self._thinned(clean)
             chosen, votes, confidence = self._surest(kept)
             weight = gather(votes.part.softmax(-1), nearest(points, kept))
-            return self._prediction(chosen, weight, similarity, confidence)
+            return self._answer(chosen, weight, similarity, confidence)
         index = farthest_points(clean, min(self.config.points, clean.shape[1]))
         kept = gather(clean, index)
         camera, frame = self._camera(observation, similarity, kept), own_frame(kept)
@@ -353,7 +353,20 @@ class AbstractRegistered(AbstractMethod):
         chosen, confidence = self._searched(views, mode)
         weight = nearest_weights(self.template, points @ frame.mT, chosen, turned)
         chosen = turn_placement(chosen, frame.mT)
-        return self._prediction(chosen, weight, similarity, confidence)
+        return self._answer(chosen, weight, similarity, confidence)
+
+    def _answer(
+        self,
+        placement: Placement,
+        part_weight: Float[Tensor, "B N P"],
+        similarity: Similarity,
+        confidence: Float[Tensor, " B"],
+    ) -> Prediction:
+        """`_prediction`, with the states that were seen in training as limits."""
+        plain = self._prediction(placement, part_weight, similarity, confidence)
+        if not bool((self.pseudo.trust > 0).any()):  # not trained yet
+            return plain
+        return replace(plain, joint_limits=metric_limits(self.template, self._limits(), similarity))
 
     def _surest(self, kept: Float[Tensor, "B K 3"]) -> tuple[Placement, Votes, Float[Tensor, " B"]]:
         """The network's placement in the frame in which it is surest, its votes, how sure it is."""

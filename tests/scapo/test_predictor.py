@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
-from scapo.predictor import load
+from scapo.predictor import Predictor, load, released
 from scapo.registered.method import RegisteredConfig, RegisteredScapo
 from scapo.registry import LIBRARY
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
@@ -49,9 +51,17 @@ def test_other_shapes_are_refused(saved: Path, shape: tuple[int, ...]) -> None:
         load(saved).predict(np.zeros(shape, np.float32))
 
 
-def test_values_that_are_not_finite_are_refused(saved: Path) -> None:
-    with pytest.raises(ValueError, match="finite"):
-        load(saved).predict(np.full((96, 3), np.nan, np.float32))
+def test_values_that_are_not_finite_are_called_that(saved: Path) -> None:
+    points = plates(2, 96)[0].points
+    points[1, 3:5, 0] = torch.nan
+    with pytest.raises(ValueError, match=r"expected finite .* NaN or infinity in 2 of 192 points"):
+        load(saved).predict(points)
+
+
+def test_another_mode_is_refused_with_those_there_are(saved: Path) -> None:
+    words = "mode: expected one of fast, quick, refine, found 'best'"
+    with pytest.raises(ValueError, match=words):
+        inspect.unwrap(Predictor.predict)(load(saved), plates(1, 96)[0].points, "best")
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
@@ -82,3 +92,9 @@ def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
     assert few.part_weight.shape == (2, 40, 2)
     with pytest.raises(ValueError, match="at least one cloud, found"):
         load(tmp_path).predict(np.zeros((0, 96, 3)))
+
+
+def test_released_weights_are_those_of_categories() -> None:
+    for category, path in released().items():
+        assert category in CATEGORIES
+        assert path.is_file()

@@ -11,8 +11,15 @@ from torch.testing import assert_close
 
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply, invert, joint_motion, random_rotations
-from scapo.registered.decode import canonical_points, nearest_weights, placed_prediction, smoothed
-from scapo.registered.template import Placement
+from scapo.registered.decode import (
+    canonical_surface,
+    metric_limits,
+    nearest_weights,
+    placed_prediction,
+    smoothed,
+)
+from scapo.registered.joint_limits import limits_of
+from scapo.registered.template import ArticulatedTemplate, Placement
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
@@ -56,7 +63,13 @@ def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
         own = shape.logit.softmax(-1)[:, part] > 0.999
         carried = apply(pose, found.canonical_points[:, own])
         assert_close(carried, points[:, own], atol=2e-3, rtol=0)
-    still = canonical_points(shape, placement)
+    assert found.canonical_normals is not None
+    assert found.canonical_part is not None
+    turned = (base[:, None, :3, :3] @ found.canonical_normals[..., None])[..., 0]
+    body = found.canonical_part[0] == 0
+    assert_close(turned[:, body], shape.place(placement)[1][:, body], atol=2e-3, rtol=0)
+    assert (found.canonical_part == shape.logit.argmax(-1)).all()
+    still = canonical_surface(shape, placement)[0]
     assert_close(still[0], still[2], atol=1e-6, rtol=0)
 
 
@@ -84,3 +97,15 @@ def test_single_wrong_labels_are_outvoted():
 def test_what_lies_on_a_target_far_from_others_is_its_own():
     target = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
     assert_close(smoothed(target, target, torch.eye(3)), torch.eye(3), atol=1e-6, rtol=0)
+
+
+def test_limits_are_in_the_units_and_from_the_zero_of_the_states():
+    state = torch.linspace(0.2, 1.2, 101)[:, None]
+    _, similarity = normalise(torch.randn(2, 50, 3, generator=generator(0)) * 3)
+    turning, sliding = ArticulatedTemplate(("revolute",)), ArticulatedTemplate(("prismatic",))
+    turning.rest.fill_(0.5)
+    found = metric_limits(turning, limits_of(state, ("revolute",)), similarity)
+    assert_close(found, torch.tensor([[[-0.28, 0.68]]]).expand(2, 1, 2), atol=1e-5, rtol=0)
+    found = metric_limits(sliding, limits_of(state, ("prismatic",)), similarity)
+    wanted = torch.tensor([0.22, 1.18]) / similarity.scale[:, None]
+    assert_close(found[:, 0], wanted, atol=1e-5, rtol=1e-5)

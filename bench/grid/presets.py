@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""What the presets of `run` train and score, as data: which method on which part, how, how often.
+
+Rates and times were measured on one core of two (results/experiments); they serve the estimate
+and, through the budget, the epochs of methods that a preset does not bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from bench.requests import Mode
+
+PresetName = Literal["smoke", "cpu", "paper"]
+SINGLE, SENSOR = ("laptop", "safe", "eyeglasses", "oven", "washer"), (
+    "basket", "drawer", "laptop", "scissors", "suitcase",
+)  # fmt: skip
+CATEGORIES: Mapping[str, tuple[str, ...]] = {
+    "clean": SINGLE,
+    "complete": SINGLE,
+    "isolated": SINGLE,
+    "sensor": SENSOR,
+}
+"""Of each part that is trained on."""
+REAL = {**dict.fromkeys(SENSOR, "sensor"), **dict.fromkeys(SINGLE, "clean")}
+"""Part whose models are shown the real objects of a category."""
+ABLATED = ("shape-var", "dir-align", "joint-prox", "joint-boundary")
+"""Terms of the loss that Table 3 leaves out, one at a time."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """A method in one configuration, on some parts."""
+
+    method: str
+    name: str = ""
+    """Of this configuration in names of files; by default the method's."""
+    flags: tuple[str, ...] = ()
+    """Of `train`."""
+    seeds: tuple[int, ...] = (1,)
+    modes: tuple[Mode, ...] = ("fast",)
+    parts: tuple[str, ...] = ("clean", "complete", "sensor")
+    rates: tuple[float, ...] = ()
+    """Training clouds a second in each stage; () for a training that no epochs bound."""
+    training: float | None = None
+    """Seconds of such a training; None: not known."""
+    seconds: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Of one cloud, by mode."""
+
+    @property
+    def label(self) -> str:
+        """What files call it."""
+        return self.name or self.method
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preset:
+    """A grid and its data."""
+
+    entries: tuple[Entry, ...]
+    categories: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: CATEGORIES)
+    splits: tuple[str, ...] = ("test", "test-ood")
+    """Scored unless asked otherwise."""
+    budget: float | None = None
+    """Minutes of one training; None: each method's own preset decides."""
+    calibration: int = 200
+    """Training clouds that fix the frames of a method that saw no poses."""
+    sizes: Mapping[str, tuple[int, int]] | None = None
+    """Samples and objects by split of data made here; None: the benchmark's."""
+
+
+THREE = (1, 2, 3)
+NETWORKS = (
+    Entry(method="gcn3d", rates=(183,), seconds={"fast": 0.025}),
+    Entry(method="pointnet2", rates=(155,), seconds={"fast": 0.03}),
+    Entry(method="npcs-epn", rates=(29,), seconds={"fast": 0.03}, parts=("clean", "complete")),
+    Entry(method="icp", training=30, seconds={"fast": 0.42}, parts=("clean", "complete")),
+    Entry(method="eap", rates=(11, 8), seconds={"fast": 0.1},
+          parts=("clean", "complete", "isolated")),
+    Entry(method="op-align", seeds=THREE, rates=(37,), seconds={"fast": 0.018}),
+    Entry(method="op-align", name="op-align-isolated", rates=(37,), seconds={"fast": 0.018},
+          parts=("isolated",)),
+    Entry(method="scapo", seeds=THREE, rates=(115, 105), seconds={"fast": 0.01}),
+    Entry(method="scapo", name="scapo-isolated", rates=(115, 105), seconds={"fast": 0.01},
+          parts=("isolated",)),
+)  # fmt: skip
+LABELLED = tuple(
+    Entry(method=method, name=f"{method}-sj", parts=("sensor",), rates=rates,
+          flags=("--supervision", "segmentation", "joint"), seconds={"fast": 0.02})
+    for method, rates in (("op-align", (37,)), ("scapo", (115, 105)))
+)  # fmt: skip
+"""The semi-supervised rows of Table 2."""
+ABLATIONS = tuple(
+    Entry(method="scapo", name=f"scapo-wo-{term}", parts=("clean",), rates=(115, 105),
+          flags=("--loss.without", term.replace("-", "_")), seconds={"fast": 0.01})
+    for term in ABLATED
+)  # fmt: skip
+REGISTERED = Entry(
+    method="registered",
+    seeds=THREE,
+    parts=("clean", "sensor"),
+    modes=("fast", "quick", "refine"),
+    training=1200,
+    seconds={"fast": 0.05, "quick": 0.06, "refine": 0.35},
+)
+GRID = (*NETWORKS, *LABELLED, REGISTERED, *ABLATIONS)
+
+PRESETS: Mapping[PresetName, Preset] = {
+    "smoke": Preset(
+        entries=(
+            Entry(method="pointnet2", parts=("clean",), rates=(100,), seconds={"fast": 0.05}),
+            Entry(method="icp", parts=("clean",), training=6, seconds={"fast": 0.5}),
+            Entry(method="scapo", parts=("clean",), rates=(60, 60), seconds={"fast": 0.02}),
+        ),
+        categories={"clean": ("oven",)},
+        splits=("test",),
+        budget=0.1,
+        calibration=16,
+        sizes={"train": (96, 6), "test": (16, 4)},
+    ),
+    "cpu": Preset(entries=GRID, budget=20.0),
+    "paper": Preset(entries=GRID),
+}
+
+
+def flags_of(entry: Entry, preset: str | None, minutes: float | None, clouds: int) -> list[str]:
+    """The flags of `train` that give an entry its configuration.
+
+    Args:
+        entry: The method.
+        preset: Its own preset, where it has such a flag.
+        minutes: Budget. Within one a method has as many epochs as it holds, its time in equal
+            shares for the stages, at least one each; without, its own.
+        clouds: Of the training.
+
+    >>> flags_of(Entry(method="eap", rates=(10, 5)), "cpu", 20.0, 500)
+    ['--preset', 'cpu', '--epochs', '12', '6']
+    """
+    words = [*(() if preset is None else ("--preset", preset)), *entry.flags]
+    if minutes is None or not entry.rates:
+        return words
+    share = minutes * 60 / len(entry.rates)
+    return [*words, "--epochs", *(str(max(1, int(share * rate / clouds))) for rate in entry.rates)]
+
+
+def training_seconds(entry: Entry, flags: list[str], clouds: int) -> float | None:
+    """The estimate for a training with such flags; None where nothing was measured."""
+    if "--epochs" not in flags:
+        return entry.training
+    epochs = map(int, flags[flags.index("--epochs") + 1 :])
+    return sum(count * clouds / rate for count, rate in zip(epochs, entry.rates, strict=True))

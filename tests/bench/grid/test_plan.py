@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""The plan: what it asks for, its digest, and what it is held against."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from bench.grid import plan as plans
+from bench.grid.plan import Plan, chosen, code_digest, freeze, make_plan
+from bench.grid.presets import PRESETS, REAL, flags_of, training_seconds
+from bench.methods import METHODS
+from bench.tables.spec import TABLE_1_CATEGORIES, TABLE_2_CATEGORIES
+from scapo.store import StoreError
+from tests.helpers.grids import make_splits, plan_of
+from tests.helpers.made import make_data
+
+
+@pytest.fixture(scope="module")
+def cpu(tmp_path_factory) -> Plan:
+    return make_plan("cpu", tmp_path_factory.mktemp("nothing"))
+
+
+def test_the_grid_has_every_method_of_every_table(cpu: Plan):
+    for part, categories in (("clean", TABLE_1_CATEGORIES), ("sensor", TABLE_2_CATEGORIES)):
+        found = Counter((c.category, c.label) for c in cpu.chains if c.part == part)
+        for category in categories:
+            assert {label: found[category, label] for label in ("scapo", "registered")} == {
+                "scapo": 3, "registered": 3
+            }  # fmt: skip
+            assert found[category, "gcn3d"] == found[category, "pointnet2"] == 1
+    ablated = {c.label for c in cpu.chains if c.label.startswith("scapo-wo-")}
+    assert len(ablated) == 4
+    assert [cpu.configs[label]["config"]["loss"]["without"] for label in sorted(ablated)] == [
+        ["dir_align"], ["joint_boundary"], ["joint_prox"], ["shape_var"]
+    ]  # fmt: skip
+    assert cpu.configs["scapo-sj"]["config"]["supervision"] == ["segmentation", "joint"]
+
+
+def test_every_output_is_made_once_and_every_need_is_met_before(cpu: Plan):
+    outputs = Counter(step.output for chain in cpu.chains for step in chain.steps)
+    assert max(outputs.values()) == 1
+    for chain in cpu.chains:
+        before: set[str] = set()
+        for step in chain.steps:
+            assert set(step.needs) <= before, (chain.name, step.name)
+            before.add(step.name)
+
+
+def test_only_methods_without_poses_are_calibrated(cpu: Plan):
+    for chain in cpu.chains:
+        scored = next(step for step in chain.steps if step.kind == "evaluate")
+        method = cpu.configs[chain.label]["method"]
+        assert ("--calibration" in scored.command) == ("pose" not in METHODS[method].supervision), (
+            chain.name
+        )
+
+
+def test_a_budget_bounds_the_epochs():
+    for entry in PRESETS["cpu"].entries:
+        flags = flags_of(entry, "cpu", 20.0, 5000)
+        seconds = training_seconds(entry, flags, 5000)
+        least = sum(5000 / rate for rate in entry.rates)  # one epoch of each stage
+        assert seconds is not None
+        assert seconds <= max(20 * 60, least), entry.label
+
+
+def test_real_objects_are_shown_to_one_model_of_each_method(tmp_path: Path):
+    make_splits(tmp_path)
+    make_data(tmp_path / "data" / "real", "oven", count=3, train=1)
+    make_data(tmp_path / "data" / "real", "laptop", count=3, train=1)
+    plan = make_plan("cpu", tmp_path / "data")
+    shown = Counter((c.category, c.label, c.seed, s.name) for c in plan.chains for s in c.steps
+                    if "/real/" in s.output and s.kind == "evaluate")  # fmt: skip
+    assert {category for category, *_ in shown} == {"oven", "laptop"}
+    assert set(shown.values()) == {1}
+    assert REAL["laptop"] == "clean"
+    assert REAL["drawer"] == "sensor"
+
+
+def test_chosen(tmp_path: Path):
+    make_splits(tmp_path)
+    chains = plan_of(tmp_path, 1, 2).chains
+    assert len(chosen(chains, ())) == 3
+    assert [c.name for c in chosen(chains, ("scapo/seed2",))] == ["clean/oven/scapo/seed2"]
+    assert len(chosen(chains, ("sca*", "icp"))) == 3
+    with pytest.raises(ValueError, match=r"only: expected parts \(clean\).*found 'scapo/laptop'"):
+        chosen(chains, ("scapo/laptop",))
+
+
+def test_a_frozen_plan_is_kept_and_refuses_another(tmp_path: Path, monkeypatch):
+    make_splits(tmp_path)
+    plan, path = plan_of(tmp_path), tmp_path / "plan.json"
+    assert freeze(path, plan)
+    before = path.read_bytes()
+    assert not freeze(path, dataclasses.replace(plan, commit="a later one"))  # adds the plan alone
+    assert path.read_bytes() == before
+    with pytest.raises(StoreError, match=r"differs in chains; .*--replan"):
+        freeze(path, plan_of(tmp_path, 1, 2))
+    monkeypatch.setattr(plans, "code_digest", lambda: "other code")
+    with pytest.raises(StoreError, match="differs in code"):
+        freeze(path, plan_of(tmp_path))
+    assert freeze(path, plan_of(tmp_path), anew=True)
+
+
+def test_data_that_were_not_there_may_come_but_not_change(tmp_path: Path):
+    empty, path = plan_of(tmp_path), tmp_path / "plan.json"
+    assert set(empty.data.values()) == {None}
+    freeze(path, empty)
+    make_splits(tmp_path)
+    assert not freeze(path, plan_of(tmp_path))
+    freeze(path, plan_of(tmp_path), anew=True)
+    make_data(tmp_path / "data" / "clean", "oven", count=5, train=6)
+    with pytest.raises(StoreError, match="differs in clean/oven/test"):
+        freeze(path, plan_of(tmp_path))
+
+
+@pytest.mark.parametrize("change", [{"budget_minutes": 99}, {"digest": "0" * 64}, {"format": "x"}])
+def test_a_plan_that_was_changed_by_hand_is_refused(tmp_path: Path, change):
+    make_splits(tmp_path)
+    path = tmp_path / "plan.json"
+    freeze(path, plan_of(tmp_path))
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(StoreError, match="expected a plan"):
+        freeze(path, plan_of(tmp_path))
+
+
+def test_the_digest_of_the_code_is_of_names_and_bytes(tmp_path: Path, monkeypatch):
+    for name in ("bench", "scapo", "sim_assets"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.py").write_text("1")
+    monkeypatch.setattr(plans, "PACKAGE", tmp_path / "scapo")
+    first = code_digest()
+    (tmp_path / "scapo" / "notes.txt").write_text("no code")
+    assert code_digest() == first
+    (tmp_path / "scapo" / "a.py").rename(tmp_path / "scapo" / "b.py")
+    second = code_digest()
+    (tmp_path / "scapo" / "b.py").write_text("2")
+    assert len({first, second, code_digest()}) == 3

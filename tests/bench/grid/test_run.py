@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: MIT
+"""`run`: data, plan, steps and tables in one call; the whole smoke grid, and its quick twin."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bench import __main__ as program
+from bench.cli.console import clock, grid_table
+from bench.cli.verbs import Run
+from bench.grid import command, run
+from bench.grid.run import Grid
+from bench.requests import GridRequest
+from scapo.store import StoreError
+from tests.helpers.grids import CALLS, calls, make_splits, preset
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch) -> Path:
+    monkeypatch.setitem(command.MODULES, "scapo-bench", "tests.helpers.fake_bench")
+    monkeypatch.setenv("FAKE_BENCH", str(tmp_path / CALLS))
+    monkeypatch.setattr(run, "Grid", partial(Grid, presets={"smoke": preset(1, 13)}))
+    return tmp_path
+
+
+def words(folder: Path, **more) -> Run:
+    return Run(preset="smoke", out=folder / "out", data=folder / "data", workers=0, **more)
+
+
+def said(verb: Run) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    try:
+        verb.run(console)
+    finally:
+        assert isinstance(console.file, io.StringIO)
+        text = console.file.getvalue()
+        print(text)  # noqa: T201 - for capsys
+    return text
+
+
+def test_the_quick_twin_of_smoke(folder: Path, capsys):
+    make_splits(folder)
+    with pytest.raises(RuntimeError, match="found 1 that failed; the same command tries"):
+        said(words(folder))
+    text = capsys.readouterr().out
+    assert "3 trainings, 15 of 15 steps of the plan are left; these take about" in text
+    assert "clean/oven/icp/seed1: 5 made" in text
+    assert "clean/oven/scapo/seed13: 1 failed, 3 not run" in text
+    assert "failed: clean/oven/scapo/seed13: " in text
+    assert "a seed that brings no luck" in text
+    assert calls(folder)[-1] == "tables tables"
+    assert len(json.loads((folder / "out" / "plan.json").read_text())["chains"]) == 3
+    assert "clean/oven/scapo/seed1: 6 kept" in said(words(folder, only=("scapo/seed1",)))
+
+
+def test_plan_only_writes_the_plan_alone(folder: Path):
+    assert "15 steps of the plan" in said(words(folder, plan_only=True))
+    assert [path.name for path in (folder / "out").iterdir()] == ["plan.json"]
+    assert calls(folder) == []
+
+
+def test_missing_data_are_asked_for(folder: Path, monkeypatch):
+    asked: list[list[str]] = []
+
+    def made(program, words, log):
+        asked.append([program, *words])
+        make_splits(folder)
+
+    monkeypatch.setattr(run, "run_command", made)
+    grid = run.Grid(GridRequest(preset="smoke", out=folder / "out", data=folder / "data"))
+    plan, _ = grid.plan(lambda line: None)
+    assert [words[:3] for words in asked] == [["scapo-data", "generate", "oven"]] * 2
+    assert asked[1][-8:] == ["--split", "test", "--count", "4", "--instances", "2", "--seed", "2"]
+    assert None not in plan.data.values()
+    asked.clear()
+    request = GridRequest(preset="cpu", out=folder / "cpu", only=("sensor/laptop/icp",))
+    with pytest.raises(ValueError, match="only: expected parts"):
+        Grid(request).plan(lambda line: None)  # ICP is not run on sensor
+    request = GridRequest(preset="cpu", out=folder / "cpu", only=("clean/gcn3d/oven",),
+                          real=folder / "models")  # fmt: skip
+    Grid(request).plan(lambda line: None)
+    data = str(folder / "cpu" / "data")
+    workers = asked[0][asked[0].index("--workers") + 1]
+    start = ["scapo-data", "benchmark", "sim-art/2", "--out", data, "--workers", workers, "--only"]
+    assert asked == [
+        [*start, "real", "--real", str(folder / "models")],
+        [*start, "clean/oven/train", "clean/oven/test", "clean/oven/test-ood"],
+    ]
+
+
+def test_one_run_at_a_time_in_a_folder(folder: Path):
+    make_splits(folder)
+    (folder / "out").mkdir()
+    with (folder / "out" / ".lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        with pytest.raises(StoreError, match="found another at work there"):
+            said(words(folder))
+    assert "5 made" in said(words(folder, only=("icp",)))
+
+
+def test_the_table_of_what_goes_on(folder: Path):
+    make_splits(folder)
+    grid = run.Grid(GridRequest(preset="smoke", out=folder / "out", data=folder / "data"))
+    plan, chains = grid.plan(lambda line: None)
+    status = grid.status(plan, chains)
+    status.hear("clean/oven/icp/seed1", "train", False)
+    console = Console(file=io.StringIO(), width=120)
+    console.print(grid_table(status))
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    assert "1 of 3 trainings at work" in text
+    assert "clean/oven/icp/seed1" in text
+    assert "none over" in text
+    status.hear("clean/oven/icp/seed1", "train", True)
+    assert status.running["clean/oven/icp/seed1"][0] == "train"
+    assert clock(59.6) == "1 min 00 s"
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        (["--gpus", "1.5"], "--gpus: expected a share of one or a whole number, found 1.5"),
+        (["--budget-minutes", "0"], "--budget-minutes: expected more than 0, found 0.0"),
+        (["--only", "nothing", "--plan-only"], "only: expected parts (clean)"),
+    ],
+)
+def test_what_cannot_be_asked(flag: list[str], message: str, tmp_path: Path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        program.main(["run", "smoke", "--out", str(tmp_path / "out"), *flag])
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.render
+def test_smoke(tmp_path: Path, capsys):
+    program.main(["run", "smoke", "--out", str(tmp_path / "out")])
+    table = (tmp_path / "out" / "tables" / "table1.csv").read_text()
+    for method in ("PointNet++ (cpu)", "ICP", "SCAPO (cpu)"):
+        assert f",{method},ours," in table
+    capsys.readouterr()
+    program.main(["run", "smoke", "--out", str(tmp_path / "out")])
+    assert "clean/oven/scapo/seed1: 6 kept" in capsys.readouterr().out

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""Depth images become points in metres; cameras of other images and other files are refused."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from bench.infer.cloud import InputError
+from bench.infer.depth import companions, read_depth, read_intrinsics
+
+WIDTH, HEIGHT = 64, 48
+CAMERA = "60,62,33,23.5"
+MATRIX = [[60.0, 0, 33], [0, 62, 23.5], [0, 0, 1]]
+
+
+@pytest.fixture
+def image(tmp_path):
+    """A slanted surface in millimetres, a hole in it, and its mask."""
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    depth = (1000 + 5 * u + 3 * v).astype(np.uint16)
+    depth[20:24, 30:34] = 0
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[10:40, 15:50] = 255
+    Image.fromarray(depth).save(tmp_path / "a.png")
+    Image.fromarray(mask).save(tmp_path / "m.png")
+    return tmp_path / "a.png", tmp_path / "m.png", depth / 1000, mask > 0
+
+
+def test_points_project_to_their_pixels_at_their_depth(image):
+    path, mask, depth, shown = image
+    cloud = read_depth(path, CAMERA, mask, None)
+    v, u = np.nonzero(shown & (depth > 0))
+    x, y, z = cloud.points.T.astype(float)
+    np.testing.assert_allclose(z, depth[v, u], atol=1e-6)
+    np.testing.assert_allclose(60 * x / z + 33, u + 0.5, atol=1e-3)
+    np.testing.assert_allclose(62 * y / z + 23.5, v + 0.5, atol=1e-3)
+    twice = read_depth(path, CAMERA, mask, 0.002)
+    np.testing.assert_allclose(twice.points, 2 * cloud.points, rtol=1e-5)
+
+
+def test_floats_are_metres(image, tmp_path):
+    path, mask, depth, _ = image
+    floats = np.where(depth > 0, depth, np.nan).astype(np.float32)
+    Image.fromarray(floats).save(tmp_path / "f.tiff")
+    found = read_depth(tmp_path / "f.tiff", CAMERA, mask, None)
+    np.testing.assert_allclose(found.points, read_depth(path, CAMERA, mask, None).points, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"K": MATRIX},
+        {"cam_K": [x for row in MATRIX for x in row]},
+        {"camera_matrix": {"rows": 3, "cols": 3, "data": [x for row in MATRIX for x in row]}},
+        {"intrinsic_matrix": [x for row in np.array(MATRIX).T.tolist() for x in row]},
+        {"fx": 60, "fy": 62, "ppx": 33, "ppy": 23.5},
+        {"intrinsics": {"fx": 60, "fy": 62, "cx": 33, "cy": 23.5}},
+    ],
+    ids=lambda record: next(iter(record)),
+)
+def test_cameras_are_read_as_calibrations_write_them(record, tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(json.dumps(record))
+    wanted = read_intrinsics(CAMERA, WIDTH, HEIGHT)
+    assert wanted.row() == (60, 62, 33, 23.5, WIDTH, HEIGHT)
+    assert read_intrinsics(str(path), WIDTH, HEIGHT) == wanted
+
+
+def test_yaml_is_read_too(tmp_path):
+    path = tmp_path / "camera.yaml"
+    path.write_text("image_width: 64\ncamera_matrix:\n  data: [60, 0, 33, 0, 62, 23.5, 0, 0, 1]\n")
+    assert read_intrinsics(str(path), WIDTH, HEIGHT).row()[:4] == (60, 62, 33, 23.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1,2,3", "expected four numbers"),
+        ("60,62,33,x", "expected four numbers"),
+        ("-60,62,33,23", "expected finite fx, fy > 0"),
+        ("nan,62,33,23", "expected finite fx, fy > 0"),
+        ("600,620,330,235", "principal point in the image of 64 x 48"),
+        ("33,23.5,60,62", "principal point in the image"),
+        ("6000,6200,33,23", "field of view"),
+        ("1,1,33,23", "field of view"),
+        ("60,200,33,23", "square pixels"),
+        ("nowhere.json", "expected fx,fy,cx,cy or a file, found neither"),
+    ],
+)
+def test_cameras_of_other_images_are_refused(text, message):
+    with pytest.raises(InputError, match=message) as refused:
+        read_intrinsics(text, WIDTH, HEIGHT)
+    assert text in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("{", "JSON or YAML"), ("[1]", "a matrix K or fx"), ('{"K": [1, 2]}', "a matrix K or fx"),
+     ('{"fx": 1}', "a matrix K"), ('{"fx": "a", "fy": 1, "cx": 1, "cy": 1}', "a matrix K"),
+     ("!!python/object/apply:os.system [ls]", "JSON or YAML")],
+)  # fmt: skip
+def test_files_that_are_no_camera_are_refused(text, message, tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_intrinsics(str(path), WIDTH, HEIGHT)
+
+
+def test_what_is_no_depth_image_is_refused(image, tmp_path):
+    path, mask, depth, _ = image
+    with pytest.raises(InputError, match="expected --intrinsics"):
+        read_depth(path, None, mask, None)
+    with pytest.raises(InputError, match="16 bits or floats and one channel, found uint8"):
+        read_depth(mask, CAMERA, mask, None)
+    with pytest.raises(InputError, match=r"expected depths of 0.02 to 50.0 m, found 1.23e\+03"):
+        read_depth(path, CAMERA, mask, 1.0)
+    Image.fromarray(np.zeros((8, 9), np.uint8)).save(tmp_path / "small.png")
+    with pytest.raises(InputError, match="64 x 48, found 9 x 8"):
+        read_depth(path, CAMERA, tmp_path / "small.png", None)
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(tmp_path / "none.png")
+    with pytest.raises(InputError, match="pixels of the object with a depth, found none"):
+        read_depth(path, CAMERA, tmp_path / "none.png", None)
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint16)).save(tmp_path / "blind.png")
+    with pytest.raises(InputError, match="expected depths above 0, found none"):
+        read_depth(tmp_path / "blind.png", CAMERA, None, None)
+    for size in (0, 40, path.stat().st_size - 30):
+        cut = tmp_path / "cut.png"
+        cut.write_bytes(path.read_bytes()[:size])
+        with pytest.raises(InputError, match="expected a readable depth image"):
+            read_depth(cut, CAMERA, mask, None)
+    assert depth.any()
+
+
+def test_what_lies_beside_an_image_belongs_to_it(tmp_path):
+    image = tmp_path / "a.png"
+    assert companions(image).mask is None
+    assert companions(image).intrinsics is None
+    (tmp_path / "intrinsics.yaml").touch()
+    assert companions(image).intrinsics == str(tmp_path / "intrinsics.yaml")
+    (tmp_path / "a.json").touch()
+    (tmp_path / "a.mask.png").touch()
+    assert companions(image).intrinsics == str(tmp_path / "a.json")
+    assert companions(image).mask == tmp_path / "a.mask.png"

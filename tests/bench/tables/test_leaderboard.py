@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""The leaderboard: what stands in it, where its links lead, and that a browser sorts it."""
+
+from __future__ import annotations
+
+import csv
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+from bench.tables import write
+from bench.tables.leaderboard import PAGE
+from bench.tables.spec import TABLE_1_CATEGORIES
+from tests.helpers.browser import open_page
+from tests.helpers.scored import make_scores
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Two methods everywhere, one of a hostile name on laptops alone, a ladder beside one."""
+    top = tmp_path_factory.mktemp("board")
+    for name in TABLE_1_CATEGORIES:
+        make_scores(top / "scores", "scapo", name)
+        make_scores(top / "scores", "icp", name, quality=5, supervision=["segmentation"])
+    make_scores(top / "scores", "scapo", "laptop", variant="[label-order=dataset]")
+    make_scores(top / "scores", "<b onload=x>", "laptop", quality=0.1)
+    scored = next(path for path in (top / "scores").rglob("*.csv.gz") if "scapo" in path.name)
+    name = scored.relative_to(top / "scores").as_posix().removesuffix(".csv.gz")
+    ladder = top / "ladders" / name / "ladder.md"
+    ladder.parent.mkdir(parents=True)
+    ladder.write_text("a ladder")
+    write.make_tables(top / "scores", top / "tables", page=True)
+    return top
+
+
+class Links(HTMLParser):
+    """All href and id of a page, and its tags."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.ids: set[str] = set()
+        self.tags: set[str] = set()
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.tags.add(tag)
+        self.links += [str(found["href"])] if "href" in found else []
+        self.ids |= {str(found["id"])} if "id" in found else set()
+
+
+def test_every_link_leads_somewhere_and_nothing_is_loaded_from_elsewhere(folder: Path):
+    page = Links()
+    text = (folder / "tables" / PAGE).read_text()
+    page.feed(text)
+    assert any(link.endswith("ladder.md") for link in page.links)
+    assert any(link.endswith(".csv.gz") for link in page.links)
+    for link in page.links:
+        if link.startswith("#"):
+            assert link[1:] in page.ids
+        else:
+            assert (folder / "tables" / unquote(link)).resolve().is_file(), link
+    assert not {"img", "link", "iframe"} & page.tags
+    assert "http" not in text
+    assert "<b onload" not in text
+
+
+def test_a_row_has_the_means_of_the_table(folder: Path):
+    text = (folder / "tables" / PAGE).read_text()
+    line = next(row for row in text.split("<tr") if ">SCAPO</a>" in row)
+    shown = re.findall(r'data-value="([^"]*)"', line)[6:]
+    with (folder / "tables" / "table1.csv").open(newline="") as file:
+        cells = [cell for cell in csv.DictReader(file) if cell["column"] == "Mean"]
+    blocks = list(dict.fromkeys(cell["block"] for cell in cells))
+    means = {
+        c["block"]: c["value"] for c in cells if (c["method"], c["source"]) == ("SCAPO", "ours")
+    }
+    assert shown == [means.get(block, "") for block in blocks]
+    assert sum(value != "" for value in shown) >= 5
+
+
+def test_what_was_not_run_everywhere_stands_below_alone(folder: Path):
+    text = (folder / "tables" / PAGE).read_text()
+    board = text[text.index("<tbody>") : text.index("By category")]
+    names = re.findall(r'<a href="#table1-\d+">([^<]*)</a>', board)
+    assert {"SCAPO", "ICP", "SCAPO, as printed"} <= set(names)
+    assert "&lt;b onload=x&gt;" not in names
+    assert "SCAPO, one part order" not in names
+    assert "<summary>&lt;b onload=x&gt;</summary>" in text
+
+
+@pytest.mark.slow
+def test_a_browser_sorts_by_a_heading_and_opens_what_a_name_leads_to(folder: Path, tmp_path: Path):
+    with open_page((folder / "tables" / PAGE).as_uri(), tmp_path / "profile") as page:
+        column = (
+            "[...document.querySelectorAll('#table1 + div tbody tr')]"
+            ".map(row => row.children[6].dataset.value)"
+        )
+        click = "document.querySelectorAll('#table1 + div th button')[6].click()"
+        heading = "document.querySelectorAll('#table1 + div th')[6].getAttribute('aria-sort')"
+        for direction, sign in (("ascending", 1), ("descending", -1)):
+            page.evaluate(click)
+            values = page.evaluate(column)
+            numbers = [float(value) for value in values if value]
+            assert numbers == sorted(numbers, key=lambda value: sign * value)
+            assert values[len(numbers) :] == [""] * (len(values) - len(numbers))
+            assert len(numbers) > 3
+            assert page.evaluate(heading) == direction
+        page.evaluate("location.hash = '#table1-0'")
+        assert page.evaluate("document.getElementById('table1-0').open")
+        assert page.evaluate("document.querySelectorAll('table caption').length") > 0
