@@ -25,7 +25,7 @@ PROGRAMS = {"scapo-data": sim_assets.__main__.main, "scapo-bench": bench.__main_
 SMALL = {
     "generate": ["--backend", "raycast", "--points", "128", "--count", "6", "--workers", "0"],
     "check": ["--workers", "0"],
-    "train": [*(word for word in FLAGS["scapo"] if word not in ("--preset", "cpu")), "--no-pictures"],
+    "train": [*FLAGS["scapo"][2:], "--no-pictures"],
     "actuate": ["--workers", "0", "--limit", "1"],
     "preview": ["--count", "2"],
     "evaluate": ["--no-companions"],

@@ -170,6 +170,10 @@ def read_checkpoint(path: Path) -> tuple[Arrays, Header]:
             values of other types than those of `CheckpointHeader`.
     """
     path = path / WEIGHTS if path.is_dir() else path
+    if not path.exists():
+        raise StoreError(
+            f"{path}: expected a file, found none; `scapo-bench train METHOD --out RUN` makes one"
+        )
     arrays, header = read(path, CHECKPOINT)
     check_header(header, f"{path}: header")
     return arrays, header

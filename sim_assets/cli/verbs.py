@@ -336,12 +336,15 @@ class View:
     """Address to listen at; 0.0.0.0 lets other machines in."""
     source: Path | None = None
     """Folder of the models that the data set was made from, to show their meshes."""
+    predictions: Path | None = None
+    """Predictions of one of its splits, to show beside the truth: axes in orange, points by
+    predicted part."""
 
     def run(self, console: Console) -> int:
         """Serve until interrupted."""
         from sim_assets.inspect.view import Viewer
 
-        viewer = Viewer(self.path, self.source, self.host, self.port)
+        viewer = Viewer(self.path, self.source, self.host, self.port, self.predictions)
         try:
             say(console, f"{viewer.url} (Ctrl-C ends it)")
             threading.Event().wait()
