@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Write an articulated object as one GLB file (glTF 2.0), a node per link.
 
-glTF knows no joints: each link's node sits at its joint's pivot and carries kind, axis and upper
-limit in its `extras`, so that a viewer can turn it. A root node turns z up into glTF's y up.
+glTF knows no joints: each link's node sits at its joint's pivot and carries kind, axis, limits and
+the state that the file shows in its `extras`, so that a viewer can turn it. A root node turns z up
+into glTF's y up.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ def write_glb(
 def _motion(joint: Joint, offset: np.ndarray, state: float) -> dict[str, Any]:
     """Pose of a child's node in its parent's, and the joint as extra data."""
     axis = np.asarray(joint.axis, float)
-    extras = {"joint": joint.name, "kind": joint.kind, "axis": axis.tolist(), "upper": joint.upper}
+    extras = {"joint": joint.name, "kind": joint.kind, "axis": axis.tolist()}
+    extras |= {"lower": joint.lower, "upper": joint.upper, "state": state}
     if joint.kind == "prismatic":
         return {"translation": (offset + axis * state).tolist(), "extras": extras}
     rotation = [*(axis * np.sin(state / 2)).tolist(), float(np.cos(state / 2))]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -26,6 +26,8 @@ RGBA = tuple[float, float, float, float]
 Vector = Float[np.ndarray, "3"]
 DENSITY = 300.0
 """kg/m3, of the bounding box of a link: furniture and appliances are mostly air."""
+_SOLID = "-collision"
+"""In the names of meshes that are there for collisions alone."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,11 +42,27 @@ class Surface:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Inertia:
+    """Mass and its distribution, in the root link's frame at rest."""
+
+    mass: float
+    """kg, greater than 0."""
+    centre: Vector
+    """Of mass, m."""
+    moments: Float[np.ndarray, "3 3"]
+    """About the centre, kg m2; positive definite."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Link:
     """A rigid part."""
 
     name: str
     surfaces: tuple[Surface, ...]
+    collision: tuple[Surface, ...] | None = None
+    """What it collides with; None: its surfaces."""
+    inertia: Inertia | None = None
+    """None: of its bounding box at a nominal density."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,15 +110,36 @@ def write_urdf(
     """
     _check(folder, links, joints)
     with whole_folder(folder) as temporary:
-        (temporary / "meshes").mkdir()
-        frames = link_origins(links, joints)
-        for link in links:
-            for number, surface in enumerate(link.surfaces):
-                text = obj_text(surface.vertices - frames[link.name], surface.faces)
-                (temporary / _mesh_name(link, number)).write_text(text, encoding="ascii")
-        text = urdf_text(links, joints, name)
-        (temporary / "mobility.urdf").write_text(text, encoding="utf-8", newline="\n")
+        write_files(temporary, links, joints, name)
     return folder / "mobility.urdf"
+
+
+def write_files(
+    folder: Path, links: Sequence[Link], joints: Sequence[Joint], name: str = "object"
+) -> list[Path]:
+    """The same into a folder that is there, beside what it holds; returns the files, URDF first.
+
+    Args:
+        folder: Without a folder `meshes`.
+        links: As for `write_urdf`.
+        joints: As for `write_urdf`.
+        name: Of the robot.
+
+    Raises:
+        ValueError: As `write_urdf`.
+    """
+    _check(folder, links, joints)
+    (folder / "meshes").mkdir()
+    frames = link_origins(links, joints)
+    written = [folder / "mobility.urdf"]
+    text = urdf_text(links, joints, name)
+    written[0].write_text(text, encoding="utf-8", newline="\n")
+    for link in links:
+        for file, surface in _meshes(link):
+            text = obj_text(surface.vertices - frames[link.name], surface.faces)
+            (folder / file).write_text(text, encoding="ascii")
+            written.append(folder / file)
+    return written
 
 
 def _check(folder: Path, links: Sequence[Link], joints: Sequence[Joint]) -> None:
@@ -143,8 +182,15 @@ def link_origins(links: Sequence[Link], joints: Sequence[Joint]) -> dict[str, Ve
     return origins | {joint.child: np.asarray(joint.pivot, float) for joint in joints}
 
 
-def _mesh_name(link: Link, number: int) -> str:
-    return f"meshes/{link.name}-{number}.obj"
+def _mesh_name(link: Link, number: int, use: str = "") -> str:
+    return f"meshes/{link.name}{use}-{number}.obj"
+
+
+def _meshes(link: Link) -> list[tuple[str, Surface]]:
+    """The surfaces of a link, those that it collides with too, by file."""
+    shown = [(_mesh_name(link, k), surface) for k, surface in enumerate(link.surfaces)]
+    solid = enumerate(link.collision or ())
+    return shown + [(_mesh_name(link, k, _SOLID), surface) for k, surface in solid]
 
 
 def _numbers(values: Sequence[float] | np.ndarray) -> str:
@@ -189,22 +235,23 @@ def _limits(joint: Joint) -> dict[str, str]:
 
 def _add_link(robot: Element, link: Link, origin: Vector) -> None:
     node = SubElement(robot, "link", name=link.name)
-    if link.surfaces:
-        _add_inertial(node, link, origin)
+    if link.surfaces or link.inertia is not None:
+        _add_inertial(node, _inertia(link, origin))
     for number, surface in enumerate(link.surfaces):
         visual = SubElement(node, "visual", name=f"{link.name}-{number}")
-        _add_mesh(visual, link, number)
+        _add_mesh(visual, _mesh_name(link, number))
         material = SubElement(visual, "material", name=f"{link.name}-{number}-color")
         SubElement(material, "color", rgba=_numbers(np.round(surface.color, 4)))
-    for number in range(len(link.surfaces)):
+    use = "" if link.collision is None else _SOLID
+    for number in range(len(link.surfaces if link.collision is None else link.collision)):
         collision = SubElement(node, "collision", name=f"{link.name}-{number}")
-        _add_mesh(collision, link, number)
+        _add_mesh(collision, _mesh_name(link, number, use))
 
 
-def _add_mesh(node: Element, link: Link, number: int) -> None:
+def _add_mesh(node: Element, file: str) -> None:
     SubElement(node, "origin", xyz="0 0 0", rpy="0 0 0")
     geometry = SubElement(node, "geometry")
-    SubElement(geometry, "mesh", filename=_mesh_name(link, number), scale="1 1 1")
+    SubElement(geometry, "mesh", filename=file, scale="1 1 1")
 
 
 def box_inertia(points: Float[np.ndarray, "N 3"]) -> tuple[float, Vector, Vector]:
@@ -217,12 +264,31 @@ def box_inertia(points: Float[np.ndarray, "N 3"]) -> tuple[float, Vector, Vector
     return mass, (points.min(0) + points.max(0)) / 2, mass / 12 * (np.sum(size**2) - size**2)
 
 
-def _add_inertial(node: Element, link: Link, origin: Vector) -> None:
-    """That of the link's bounding box."""
+def _inertia(link: Link, origin: Vector) -> Inertia:
+    """In the link's own frame; where it has none, that of its bounding box."""
+    if link.inertia is not None:
+        return replace(link.inertia, centre=link.inertia.centre - origin)
     points = np.concatenate([surface.vertices for surface in link.surfaces]) - origin
     mass, centre, moments = box_inertia(points)
+    return Inertia(mass=mass, centre=centre, moments=np.diag(moments))
+
+
+def _add_inertial(node: Element, body: Inertia) -> None:
     inertial = SubElement(node, "inertial")
-    SubElement(inertial, "origin", xyz=_numbers(centre), rpy="0 0 0")
-    SubElement(inertial, "mass", value=_numbers([mass]))
-    ixx, iyy, izz = (np.format_float_scientific(m, precision=6) for m in moments)
-    SubElement(inertial, "inertia", ixx=ixx, ixy="0", ixz="0", iyy=iyy, iyz="0", izz=izz)
+    SubElement(inertial, "origin", xyz=_numbers(body.centre), rpy="0 0 0")
+    SubElement(inertial, "mass", value=_numbers([body.mass]))
+    SubElement(inertial, "inertia", {name: _moment(body.moments[at]) for name, at in _MOMENTS})
+
+
+_MOMENTS = (
+    ("ixx", (0, 0)),
+    ("ixy", (0, 1)),
+    ("ixz", (0, 2)),
+    ("iyy", (1, 1)),
+    ("iyz", (1, 2)),
+    ("izz", (2, 2)),
+)
+
+
+def _moment(value: float) -> str:
+    return np.format_float_scientific(value, precision=6) if value else "0"

@@ -91,6 +91,8 @@ def test_container_and_joint_data(tmp_path: Path):
         "joint": "hinge",
         "kind": "revolute",
         "axis": [0, 0, -1],
+        "lower": 0.0,
         "upper": 1.2,
+        "state": 0.0,
     }
     assert len(tree["meshes"][1]["primitives"]) == 2

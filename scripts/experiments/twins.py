@@ -1,0 +1,317 @@
+#!/usr/bin/env python
+# SPDX-License-Identifier: MIT
+"""Do exported twins load, and do their joints move them as the true objects move?
+
+    python scripts/experiments/twins.py DATA CATEGORY [CATEGORY ...] [--split val] [--count 20]
+        [--predictions FILE] [--bare]
+
+DATA is a folder of procedural objects (`sim-art-2/clean`). Without `--predictions` the true parts,
+poses and joints stand for the prediction and the model's shape is 1,600 points of the true surface
+(`--bare`: none, the observed points alone), so that what is left is the export's own error. With
+it, of one category, joints and parts are the file's, and so is the shape where it has
+`canonical_points`.
+
+Prints a row for each category: objects, hinge directions within 5 degrees, pivots within 5 % of
+the object's diagonal, URDFs that SAPIEN loads and drives through their range, URDFs that yourdfpy
+loads, and the Chamfer distance (mean of both ways, % of the diagonal: mean, worst) between the
+true object and the twin, as observed and at four other states, the base's part kept in place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+import yourdfpy
+from scipy.spatial import KDTree
+
+from bench.metrics import sample_errors
+from bench.scoring.truth import Truth, blocks
+from bench.twin.articulated import articulated
+from bench.twin.export import write_twin
+from bench.twin.record import BACKGROUND, Shape, Twin
+from bench.twin.surface import seen_samples
+from scapo.geometry.points import farthest_points
+from scapo.store import Split, open_split
+from scapo.store.predictions import Predictions
+from sim_assets.generation.assets import recover
+from sim_assets.objects import ArticulatedObject
+from sim_assets.sampling.cloud import sample_surface
+
+SHAPE, DENSE, ASKED = 1600, 40_000, 2_000
+"""Points of the stand-in for a template; of each surface for the Chamfer distance, and how many of
+them are asked for their nearest."""
+SHARES = (0.05, 0.35, 0.65, 0.95)
+"""Of the travel: the other states."""
+HINGE, PIVOT = 5.0, 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sample:
+    """One view of one object, and what is said of it."""
+
+    thing: ArticulatedObject
+    camera_T_part: np.ndarray
+    state: np.ndarray
+    twin: Twin
+    true_of: np.ndarray
+    """The true part of each predicted one."""
+    direction: float
+    pivot: float
+    """Worst joint; degrees, and share of the diagonal."""
+
+
+def outer_surface(thing: ArticulatedObject, count: int) -> tuple[np.ndarray, ...]:
+    """Points, normals and parts of the surface at rest, without what lies inside other pieces."""
+    rng = np.random.default_rng(0)
+    meshes = [thing.part_mesh(part) for part in range(len(thing.visuals))]
+    areas = np.array([mesh.area for mesh in meshes])
+    found = []
+    for part, mesh in enumerate(meshes):
+        drawn = max(int(2 * count * areas[part] / areas.sum()), count // 4)
+        points, face = sample_surface(mesh, drawn, rng)
+        normals = mesh.face_normals[face]
+        hidden = np.zeros(len(points), bool)
+        for visual in thing.visuals[part]:
+            hidden |= visual.mesh.contains(points + 1e-4 * normals)
+        found.append((points[~hidden], normals[~hidden], np.full((~hidden).sum(), part)))
+    points, normals, part = (np.concatenate(one) for one in zip(*found, strict=True))
+    if count > SHAPE:
+        kept = rng.permutation(len(points))[:count]
+    else:
+        kept = farthest_points(torch.from_numpy(points), min(count, len(points))).numpy()
+    return points[kept], normals[kept], part[kept]
+
+
+def posed(points: np.ndarray, part: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Points of parts in the frame of the poses."""
+    return np.einsum("nij,nj->ni", poses[part, :3, :3], points) + poses[part, :3, 3]
+
+
+def true_twin(thing: ArticulatedObject, truth: Truth, i: int, bare: bool) -> Twin:
+    """The labels as a prediction."""
+    poses, shape = truth.camera_T_part[i], None
+    if not bare:
+        points, normals, part = outer_surface(thing, SHAPE)
+        turns = poses.copy()
+        turns[:, :3, 3] = 0
+        shape = Shape(
+            points=posed(points, part, poses), normals=posed(normals, part, turns), part=part
+        )
+    upper = np.maximum(thing.upper, truth.joint_state[i])
+    return Twin(
+        name=thing.instance,
+        category=thing.category,
+        points=truth.points[i],
+        part=np.where(truth.part[i] < 0, BACKGROUND, truth.part[i]),
+        camera_T_part=poses,
+        pivot=truth.joint_pivot[i],
+        axis=truth.joint_axis[i],
+        state=truth.joint_state[i],
+        limits=np.stack([np.zeros_like(upper), upper], -1),
+        shape=shape,
+    )
+
+
+def predicted_twin(thing: ArticulatedObject, truth: Truth, i: int, row: dict) -> Twin:
+    """What a predictions file says of a sample; limits are the category's about its state."""
+    part = row["part"] if "part" in row else row["part_weight"].argmax(-1)
+    poses, state = row["camera_T_part"].astype(float), row["joint_state"].astype(float)
+    upper = np.array([joint.upper for joint in thing.category.joints])
+    shape = None
+    if "canonical_points" in row:
+        placed = np.einsum("pij,mj->pmi", poses[:, :3, :3], row["canonical_points"].astype(float))
+        placed = placed + poses[:, None, :3, 3]
+        gaps = [
+            KDTree(truth.points[i][part == p]).query(placed[p])[0]
+            if (part == p).any()
+            else np.full(placed.shape[1], np.inf)
+            for p in range(len(poses))
+        ]
+        own = np.argmin(gaps, 0)
+        points = placed[own, np.arange(placed.shape[1])]
+        shape = Shape(points=points, normals=seen_samples(points, np.zeros(3)).normals, part=own)
+    return Twin(
+        name=thing.instance,
+        category=thing.category,
+        points=truth.points[i],
+        part=np.where(part < 0, BACKGROUND, part),
+        camera_T_part=poses,
+        pivot=row["joint_pivot"].astype(float),
+        axis=row["joint_axis"].astype(float),
+        state=state,
+        limits=np.stack([state - upper, state + upper], -1),
+        shape=shape,
+    )
+
+
+def samples(split: Split, count: int, predictions: Path | None, bare: bool) -> list[Sample]:
+    """One view of each of the first objects."""
+    made: list[Sample] = []
+    opened = None if predictions is None else Predictions(predictions, split)
+    for truth in blocks(split):
+        rows = {} if opened is None else opened.rows(truth.first, len(truth))
+        for i in np.unique(truth.instance, return_index=True)[1]:
+            if len(made) == count:
+                return made
+            thing = recover(split.manifest, int(truth.instance[i]))
+            row = {name: array[i] for name, array in rows.items()}
+            twin = predicted_twin(thing, truth, i, row) if row else true_twin(thing, truth, i, bare)
+            made.append(sample(thing, truth, i, twin))
+    return made
+
+
+def sample(thing: ArticulatedObject, truth: Truth, i: int, twin: Twin) -> Sample:
+    """With the errors of its joints, as the benchmark measures them."""
+    label = np.where(twin.part == BACKGROUND, 0, twin.part)
+    errors = sample_errors(
+        part_true=truth.part[i][None],
+        camera_T_part_true=truth.camera_T_part[i][None],
+        pivot_true=truth.joint_pivot[i][None],
+        axis_true=truth.joint_axis[i][None],
+        part_pred=label[None],
+        camera_T_part_pred=None,
+        pivot_pred=twin.pivot[None],
+        axis_pred=twin.axis[None],
+    )
+    slides = np.array([joint.kind == "prismatic" for joint in thing.category.joints])
+    off = np.where(slides, 0.0, errors["joint_pivot"][0])
+    return Sample(
+        thing=thing,
+        camera_T_part=truth.camera_T_part[i],
+        state=truth.joint_state[i],
+        twin=twin,
+        true_of=errors["order"][0].astype(int),
+        direction=float(np.max(errors["joint_direction"][0])),
+        pivot=float(np.max(off) / np.linalg.norm(thing.extents())),
+    )
+
+
+def chamfers(one: Sample, urdf: Path) -> list[float]:
+    """As observed first, then at the other states; % of the diagonal."""
+    robot = yourdfpy.URDF.load(str(urdf))
+    made = articulated(one.twin)
+    names = [link.name for link in made.links]
+    drawn = {}
+    for name in names:
+        file = urdf.parent / f"meshes/{name}-0.obj"
+        if file.is_file():
+            mesh = trimesh.load_mesh(file)
+            count = max(200, DENSE // len(names))
+            drawn[name] = sample_surface(mesh, count, np.random.default_rng(1))[0]
+    points, _, part = outer_surface(one.thing, DENSE)
+    errors = []
+    for target in [one.state, *(share * one.thing.upper for share in SHARES)]:
+        robot.update_cfg(twin_state(one, target - one.state))
+        found = np.concatenate(
+            [
+                trimesh.transform_points(
+                    drawn[name], made.camera_T_root @ robot.get_transform(name, names[0])
+                )
+                for name in drawn
+            ]
+        )
+        poses = one.thing.pose(target)
+        kept = int(one.true_of[0])  # the true part in the place of the twin's root
+        camera_T_object = one.camera_T_part[kept] @ np.linalg.inv(poses[kept])
+        true = posed(points, part, camera_T_object @ poses)
+        both = one_way(true, found) + one_way(found, true)
+        errors.append(50 * both / float(np.linalg.norm(one.thing.extents())))
+    return errors
+
+
+def one_way(points: np.ndarray, others: np.ndarray) -> float:
+    """Mean distance of some of the points to the nearest of the others, m."""
+    asked = np.random.default_rng(2).choice(len(points), min(ASKED, len(points)), replace=False)
+    return float(np.mean(KDTree(others).query(points[asked])[0]))
+
+
+def twin_state(one: Sample, moved: np.ndarray) -> dict[str, float]:
+    """The twin's joints when the true ones have moved on by so much."""
+    made = articulated(one.twin)
+    wanted = {}
+    for j, joint in enumerate(made.joints):
+        parts = {int(one.true_of[0]), int(one.true_of[one.twin.category.joints[j].child])}
+        true = next(
+            k
+            for k, spec in enumerate(one.thing.category.joints)
+            if {spec.parent, spec.child} & parts - {0}
+        )
+        axis = (one.camera_T_part[0] @ np.append(one.thing.axis[true], 0))[:3]
+        swapped = -1.0 if int(one.true_of[0]) == one.thing.category.joints[true].child else 1.0
+        sense = swapped * (1.0 if axis @ one.twin.axis[j] >= 0 else -1.0)
+        wanted[joint.name] = made.state[joint.name] + sense * float(moved[true])
+    return wanted
+
+
+def drives(urdf: Path) -> bool:
+    """Whether SAPIEN loads it and its joints go from end to end and back as they are told."""
+    import sapien
+
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+    scene.set_timestep(1 / 240)
+    loader = scene.create_urdf_loader()
+    loader.fix_root_link = True
+    builder = loader.load_file_as_articulation_builder(str(urdf))
+    for link in builder.link_builders:
+        link.visual_records.clear()  # they need a renderer
+    robot = builder.build()
+    low, high = robot.get_qlimits().T
+    for joint in robot.active_joints:
+        joint.set_drive_properties(stiffness=400, damping=40, mode="acceleration")
+    for end, start in ((high, low), (low, high)):
+        for share in [*np.linspace(0, 1, 180), *[1.0] * 120]:
+            for k, joint in enumerate(robot.active_joints):
+                joint.set_drive_target(float(start[k] + share * (end[k] - start[k])))
+            scene.step()
+        if not (np.abs(robot.qpos - end) < 0.05 * (high - low) + 0.01).all():
+            return False
+    return True
+
+
+def measure(category: str, found: list[Sample]) -> str:
+    """The row of a category."""
+    loaded = driven = 0
+    errors = []
+    with tempfile.TemporaryDirectory() as folder:
+        for k, one in enumerate(found):
+            urdf = write_twin(one.twin, Path(folder) / str(k))[0]
+            errors.append(chamfers(one, urdf))
+            loaded += 1  # by yourdfpy, in `chamfers`
+            driven += drives(urdf)
+    table = np.array(errors)
+    straight = sum(one.direction <= HINGE for one in found)
+    near = sum(one.pivot <= PIVOT for one in found)
+    return (
+        f"{category:11s} {len(found):4d} {straight:6d} {near:6d} {driven:7d} {loaded:9d}   "
+        f"{table[:, 0].mean():6.2f} {table[:, 0].max():6.2f}   "
+        f"{table[:, 1:].mean():6.2f} {table[:, 1:].max():6.2f}"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("category", nargs="+")
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--predictions", type=Path)
+    parser.add_argument("--bare", action="store_true")
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print("category       n  hinge  pivot  SAPIEN  yourdfpy  as observed    other states")
+    for category in given.category:
+        split = open_split(given.data, category, given.split)
+        found = samples(split, given.count, given.predictions, given.bare)
+        print(measure(category, found), flush=True)
+
+
+if __name__ == "__main__":
+    main()
