@@ -152,10 +152,10 @@ def results_table(made: ResultsTable) -> Table:
     table = _table(f"Table {made.number}. {made.title}.")
     groups = [name for name, width in made.groups for _ in range(width)]
     for heading in (made.first, "Method"):
-        table.add_column(escape(heading))
+        table.add_column(Text(heading))
     for k, heading in enumerate(made.columns):
-        group = f"{groups[k]}\n" if groups and groups[k] else ""
-        table.add_column(escape(f"{group}{heading}"), justify="right")
+        group = f"{groups[k]} " if groups else ""
+        table.add_column(Text(one_line(f"{group}{heading}")), justify="right")
     for block in made.blocks:
         first = block.heading
         for row in block.rows:
