@@ -245,6 +245,20 @@ class TrainRequest(Generic[M]):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ReleaseRequest(RunRequest):
+    """A finished run, and what its card is made from."""
+
+    out: Path
+    """Released checkpoint: results/checkpoints/CATEGORY.safetensors of the method that answers by
+    default, CATEGORY-METHOD.safetensors of another. Its card is written beside it, ten answers to
+    checks/ beside its folder."""
+    scores: Path | None = None
+    """Folder of scores; those of this run go into the card."""
+    split: str = "val"
+    """Split of the clouds whose answers are kept."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GridRequest:
     """Which grid is run, on what, and how."""
 

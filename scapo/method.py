@@ -222,6 +222,9 @@ class AbstractMethod(nn.Module, ABC):
                 knows in all modes.
         """
 
+    def strip(self) -> None:
+        """Let go of what training alone needs, before the model is released; nothing by default."""
+
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
         """What training shows of its progress, by name: a template, reconstructions, nothing.
 

@@ -19,7 +19,10 @@ from scapo.store.schema import StoreError
 from scapo.types import Observation, Prediction
 
 RELEASED = "weights"
-"""Folder in the package with one checkpoint per released category."""
+"""Folder in the package with the released checkpoints: CATEGORY.safetensors of the method that
+answers by default, CATEGORY-METHOD.safetensors of others."""
+CHECKOUT = Path("results", "checkpoints")
+"""The same folder in a checkout, from which the package's is made."""
 
 
 class Predictor:
@@ -93,7 +96,8 @@ def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
 
     Args:
         path_or_category: A run folder, a checkpoint file, or the name of a category whose
-            weights come with the package.
+            weights come with the package, such as `oven`; `oven/scapo` for those of a method that
+            is not the default.
         device: Where it runs.
 
     Raises:
@@ -111,7 +115,7 @@ def find(path_or_category: str | Path) -> Path:
     path = Path(path_or_category)
     if path.exists():
         return path
-    weights = released()
+    weights = {name.replace("-", "/", 1): file for name, file in _weights().items()}
     if str(path_or_category) in weights:
         return weights[str(path_or_category)]
     known = ", ".join(weights) or "none yet"
@@ -122,7 +126,13 @@ def find(path_or_category: str | Path) -> Path:
 
 
 def released() -> dict[str, Path]:
-    """Checkpoints that come with the package, by category."""
-    folder = Path(str(files("scapo"))) / RELEASED
-    found = sorted(folder.glob("*.safetensors"))
-    return {path.stem: path for path in found if path.stem in CATEGORIES}
+    """Checkpoints that come with the package, by category: each of its default method."""
+    return {name: path for name, path in _weights().items() if name in CATEGORIES}
+
+
+def _weights() -> dict[str, Path]:
+    """Every checkpoint that comes with the package or the checkout, by the name of its file."""
+    package = Path(str(files("scapo")))
+    folders = (package / RELEASED, package.parent / CHECKOUT)
+    found = [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
+    return {path.stem: path for path in found if path.stem.partition("-")[0] in CATEGORIES}

@@ -256,6 +256,18 @@ class Calibrate(requests.CalibrateRequest):
             say(console, f"Written: {path}")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Release(requests.ReleaseRequest):
+    """Make a small checkpoint of a finished run, with its card, for scapo.load and infer."""
+
+    def run(self, console: Console) -> None:
+        """Write them, and say how large the model is."""
+        from bench.runs.release import release
+
+        for path in release(self):
+            say(console, f"{path}: {path.stat().st_size:,} bytes")
+
+
 VERBS: dict[str, Any] = {
     "train": Train[tuple[()]],
     "predict": Predict,
@@ -267,6 +279,7 @@ VERBS: dict[str, Any] = {
     "study": Study,
     "reference": Reference,
     "run": Run,
+    "release": Release,
     "infer": Infer,
     "calibrate": Calibrate,
 }

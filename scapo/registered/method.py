@@ -249,6 +249,10 @@ class AbstractRegistered(AbstractMethod):
         self.pseudo.set(key, placement, camera, trust)
         self.pseudo.show(ShownPoints.of(views))
 
+    def strip(self) -> None:
+        """Keep of the training clouds what `quick` and `refine` look at: those placed surely."""
+        self.pseudo.keep_trusted()
+
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`vote_losses`)."""
         del labels

@@ -51,6 +51,14 @@ class PseudoLabels(nn.Module):
         """Keep what the clouds look like."""
         self.points, self.normals = shown.points.clone(), shown.normals.clone()
 
+    def keep_trusted(self) -> None:
+        """Forget the clouds that nothing is learned from, and which points are whose."""
+        kept = self.trust > 0
+        for name in (*self.NAMES, *self.SHOWN):
+            values = getattr(self, name)
+            setattr(self, name, values[kept] if len(values) == len(kept) else values)
+        self.belonging = self.belonging[:0, :0]
+
     def placement(self) -> Placement:
         """All of them, about the category's axes."""
         values = {name: getattr(self, name) for name in self.PLACEMENT}

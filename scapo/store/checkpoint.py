@@ -43,13 +43,13 @@ def array(tensor: Tensor) -> np.ndarray:
 
 
 def load_arrays(module: nn.Module, arrays: Arrays, where: Path, prefix: str = "") -> None:
-    """Fill a module's state dict.
+    """Fill a module's state dict; numbers of half precision, as released models have, are widened.
 
     Raises:
         StoreError: A tensor is missing, left over, of another shape, or not finite.
     """
     state = {
-        name.removeprefix(prefix): torch.from_numpy(value.copy())
+        name.removeprefix(prefix): _single(torch.from_numpy(value.copy()))
         for name, value in arrays.items()
         if name.startswith(prefix)
     }
@@ -61,6 +61,10 @@ def load_arrays(module: nn.Module, arrays: Arrays, where: Path, prefix: str = ""
     except RuntimeError as error:
         found = " ".join(str(error).split())
         raise StoreError(f"{where}: expected the method's tensors, found {found}") from error
+
+
+def _single(tensor: Tensor) -> Tensor:
+    return tensor.float() if tensor.dtype == torch.float16 else tensor
 
 
 def optimiser_arrays(optimizer: torch.optim.Optimizer) -> Arrays:

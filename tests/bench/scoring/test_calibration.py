@@ -100,6 +100,26 @@ def test_calibration_finds_hidden_frames_and_states(split, tmp_path):
     assert uncalibrated["part_rotation", "deg"].mean() > 20
 
 
+def test_real_objects_are_calibrated_on_the_training_split_of_another_part(tmp_path):
+    made.make_data(tmp_path / "complete", "laptop", train=20, points=48)  # nobody's
+    test = made.make_data(tmp_path / "clean", "laptop", count=11, train=30, points=48)
+    train = Split(root(test) / "laptop" / "train")
+    arrays = made.sample_arrays("laptop", 9, 48, seed=7)
+    real = made.write_split(tmp_path / "real", "laptop", "test", arrays)
+    paths = [tmp_path / "r.safetensors", tmp_path / "c.safetensors"]
+    for path, split, seed in zip(paths, (real, train), (2, 1), strict=True):
+        write_predictions(path, made.header_of(split), own_frames(split, seed))
+    request = Request(predictions=paths[0], data=tmp_path / "real", out=tmp_path / "s.csv.gz",
+                      calibration=paths[1])  # fmt: skip
+    report = evaluate(request)
+    assert report["calibration"]["data"] == train.manifest.digest
+    assert report["summary"]["part_rotation_deg"]["mean"] == pytest.approx(0, abs=1e-3)
+    assert evaluate(dataclasses.replace(request, data=tmp_path))["summary"] == report["summary"]
+    train.folder.rename(tmp_path / "gone")
+    with pytest.raises(StoreError, match="train"):
+        evaluate(request)
+
+
 def test_calibration_on_tested_or_foreign_predictions_is_refused(laptop, tmp_path):
     path = made.write_truth(tmp_path / "p.safetensors", laptop)
     train = Split(root(laptop) / "laptop" / "train")

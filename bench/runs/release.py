@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: MIT
+"""`release`: a trained run as a small checkpoint to give away, with its card and ten answers.
+
+Numbers of half precision, nothing of the training clouds but what prediction looks at. The answers
+are kept beside the inputs, so that whoever loads the model can see that it still gives them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from bench.methods import find, load
+from bench.requests import ReleaseRequest
+from bench.scoring.score_files import SUFFIX, Report, read_report
+from scapo.method import AbstractMethod, Mode, evenly
+from scapo.predictor import Predictor
+from scapo.records import map_tensors
+from scapo.store import Header, StoreError, open_split, sha256_file, write, write_bytes
+from scapo.store.checkpoint import RUN_FIELDS, WEIGHTS, require_fields, to_arrays
+from scapo.store.files import read
+from scapo.store.samples import SampleDataset, observe, observed
+
+MAX_BYTES = 4 << 20
+"""Of a released model."""
+ANSWERS = 10
+"""Clouds whose answers are kept."""
+MODES: tuple[Mode, ...] = ("fast", "quick")
+"""Whose answers are kept."""
+CHECKS = "checks"
+"""Folder of the answers, beside that of the checkpoints."""
+FORMAT = "scapo-answers/1"
+LEGEND = (
+    "Means. S: part IoU; D: direction of the joints; C: their pivots; R, t: poses of the parts. C "
+    "and t in units of 4 x the cloud's mean radius."
+)
+CAMERA = """
+`quick` and `refine` use where the camera stands: the origin of the cloud's frame, or `sensor`."""
+CARD = """# {title}: {category}
+
+`scapo.load("{name}").predict(points)`: parts, poses and joints of one {category} in a
+point cloud, (N, 3), metres, camera frame (x right, y down, z forward).{camera}
+
+| | |
+|---|---|
+| method | `{method}`, {parameters:,} parameters, half precision |
+| trained on | data with digest `{data_digest}`, labels: {labels} |
+| seed, steps, commit | {seed}, {steps:,}, `{commit}` |
+| made by | `scapo-bench train {method}`, `scapo-bench release` |
+| licence | MIT, as the code; the data are procedural |
+
+## Scores
+
+{scores}
+
+## Intended use
+
+Research on articulated objects, and a start for robots that open and close things, with the object
+segmented from its surroundings. One object of the category, in the units of the camera.
+
+## Limits
+
+- Trained on procedural shapes: real objects look different (rows `real`, where there are any).
+- Views that several poses explain are answered by one of them; the scores say how often.
+- Without labels in training the frames of the parts are the method's own, up to one rigid offset
+  for each part (`scapo-bench calibrate` learns it from labelled clouds).
+- Nothing tells whether a cloud shows the category at all. No safety may rest on an answer.
+
+<details><summary>Configuration</summary>
+
+```json
+{config}
+```
+
+</details>
+"""
+METRICS = (
+    ("S, %", "iou_1", 100.0, 1),
+    ("D, deg", "joint_direction_deg", 1.0, 1),
+    ("C", "joint_pivot_r4", 1.0, 3),
+    ("R, deg", "part_rotation_deg", 1.0, 1),
+    ("t", "part_translation_r4", 1.0, 3),
+)
+"""Of the card: heading, key in a report, factor, decimals."""
+
+
+def release(request: ReleaseRequest) -> list[Path]:
+    """Write checkpoint, card and answers; returns their paths.
+
+    Raises:
+        StoreError: No finished run there, no such data, or a model that does not fit.
+    """
+    if request.out.suffix != ".safetensors":
+        raise StoreError(f"--out: expected a name that ends in .safetensors, found {request.out}")
+    method, header = load(request.checkpoint)
+    require_fields(header, RUN_FIELDS, request.checkpoint)
+    if not header["finished"]:
+        raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
+    source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
+    slim(method, request.out, {**header, "source": sha256_file(source)})
+    card = request.out.with_suffix(".md")
+    write_bytes(card, card_of(header, request).encode())
+    answers = answers_file(request.out)
+    keep_answers(request, header["category"], answers)
+    return [request.out, card, answers]
+
+
+def slim(method: AbstractMethod, out: Path, header: Header) -> None:
+    """Write a model in half precision, without what training alone needs.
+
+    Raises:
+        StoreError: It is larger than `MAX_BYTES`, or has a number that half precision has not.
+    """
+    method.strip()
+    arrays = to_arrays(method)
+    for name, array in arrays.items():
+        if array.dtype != np.float32:
+            continue
+        with np.errstate(over="ignore"):
+            arrays[name] = array.astype(np.float16)
+        if not np.isfinite(arrays[name]).all():
+            raise StoreError(f"{out}: tensor {name!r}: expected numbers below 65,504, found larger")
+    size = sum(array.nbytes for array in arrays.values())
+    if size > MAX_BYTES:
+        raise StoreError(f"{out}: expected at most {MAX_BYTES:,} bytes, found {size:,}")
+    write(out, arrays, header)
+
+
+def answers_file(checkpoint: Path) -> Path:
+    """Where the answers of a released checkpoint are kept."""
+    return checkpoint.parent.parent / CHECKS / checkpoint.name
+
+
+def keep_answers(request: ReleaseRequest, category: str, out: Path) -> None:
+    """Ask the released model about clouds spread over a split, and keep them with what it says."""
+    split = open_split(request.data, category, request.split)
+    samples = SampleDataset(split, observed(split))
+    observation = observe(samples.batch(evenly(len(samples), ANSWERS)))
+    points = observation.points.numpy()
+    arrays = {"points": points}
+    for mode, prediction in _asked(request.out, points):
+        arrays |= {f"{mode}/{name}": value for name, value in prediction.items()}
+    header = {"format": FORMAT, "model": sha256_file(request.out), "split": split.manifest.split,
+              "data_digest": split.manifest.digest}  # fmt: skip
+    write(out, arrays, header)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Differences:
+    """How far a model's answers are from those that were kept, the largest of each cloud."""
+
+    part_weight: np.ndarray
+    pose: np.ndarray
+    """Of any number of the matrices; metres, and of rotations without a unit."""
+
+
+def compare_answers(checkpoint: Path) -> dict[str, Differences]:
+    """The differences of each mode, by asking the model the same again.
+
+    Raises:
+        StoreError: No answers are kept, or those of another checkpoint.
+    """
+    path = answers_file(checkpoint)
+    kept, header = read(path, FORMAT)
+    digest = sha256_file(checkpoint)
+    if header.get("model") != digest:
+        raise StoreError(f"{path}: expected answers of {digest[:12]}, found those of another model")
+    found = {}
+    for mode, said in _asked(checkpoint, kept["points"]):
+        off = {name: np.abs(said[name] - kept[f"{mode}/{name}"]) for name in said}
+        found[mode] = Differences(
+            part_weight=off["part_weight"].max((1, 2)), pose=off["camera_T_part"].max((1, 2, 3))
+        )
+    return found
+
+
+def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[str, np.ndarray]]]:
+    """The answers of each mode, float32."""
+    model = Predictor(load(checkpoint)[0], "cpu")
+    for mode in MODES:
+        with torch.no_grad():
+            said = map_tensors(model.predict(points, mode), lambda one: one.detach().float())
+        if said.part_weight is None or said.camera_T_part is None:
+            raise StoreError(f"{checkpoint}: expected parts and poses in mode {mode}, found none")
+        yield mode, {"part_weight": said.part_weight.numpy(),
+                     "camera_T_part": said.camera_T_part.numpy()}  # fmt: skip
+
+
+def card_of(header: Header, request: ReleaseRequest) -> str:
+    """The model's card, in Markdown."""
+    entry = find(header["method"])
+    return CARD.format(
+        **{name: header.get(name, "") for name in ("method", "category", "data_digest", "seed")},
+        title=header["method"] if entry is None else entry.title,
+        name=request.out.stem.replace("-", "/", 1),
+        camera=CAMERA if entry is not None and entry.camera else "",
+        parameters=header.get("parameters", 0),
+        steps=header["steps"],
+        commit=header.get("commit", ""),
+        labels=", ".join(header["supervision"]) or "none",
+        scores=scores_table(header, request.scores),
+        config=json.dumps(header["config"], indent=1, sort_keys=True),
+    )
+
+
+def scores_table(header: Header, scores: Path | None) -> str:
+    """The scores of this run in a folder, by data, split, trait and variant."""
+    if scores is None:
+        return "Not given."
+    rows = [
+        (*_where(report), variant or "fast", trait, summary)
+        for report in _reports(header, scores)
+        for variant, trait, summary in _summaries(report)
+    ]
+    if not rows:
+        return "None of this run."
+    heads = ["data", "split", "variant", "objects", *(metric[0] for metric in METRICS)]
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for data, split, variant, trait, summary in sorted(rows, key=lambda row: row[:4]):
+        lines.append(f"| {data} | {split} | {variant} | {trait} | {_numbers(summary)} |")
+    return "\n".join([*lines, "", LEGEND])
+
+
+def _where(report: Report) -> tuple[str, str]:
+    return report.data.partition("@")[0], report.split
+
+
+def _reports(header: Header, scores: Path) -> Iterator[Report]:
+    """The reports of this very run, of the benchmark's readings and of ambiguous views."""
+    for path in sorted(scores.rglob(f"*{SUFFIX}")):
+        report = read_report(path)
+        same = (report.method, report.category, report.seed) == (
+            header["method"], header["category"], header["seed"]
+        )  # fmt: skip
+        if same and report.run.get("data_digest") == header["data_digest"] and (
+            report.run.get("config") == header["config"]
+        ) and "label-order" not in report.variant:  # fmt: skip
+            yield report
+
+
+def _summaries(report: Report) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    whole = {name: {"mean": one.mean} for name, one in report.summary.items()}
+    yield report.variant, "all", whole
+    for trait, found in report.by_trait.items():
+        yield report.variant, trait or "as in training", found["summary"]
+
+
+def _numbers(summary: Mapping[str, Any]) -> str:
+    cells = []
+    for _, key, factor, decimals in METRICS:
+        mean = summary.get(key, {}).get("mean")
+        cells.append("–" if mean is None else f"{factor * mean:.{decimals}f}")
+    return " | ".join(cells)
