@@ -20,7 +20,7 @@ from scapo.categories import JointKind
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import map_tensors
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.gauge import along_main_directions, choose_axes, tells_frame
+from scapo.registered.gauge import along_main_directions, choose_axes, settle_hinges, tells_frame
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.motion_segmentation import rebuild
 from scapo.registered.pose_refinement import SCALE_WEIGHT, SHIFT_WEIGHT, SLIDE_WEIGHT, search_states
@@ -39,8 +39,9 @@ TRANSLATION_RATE, SHIFT_RATE, SCALE_RATE = 0.004, 0.006, 0.008
 POINT_RATE, PIVOT_RATE = 0.002, 0.012  # Normalised lengths a step; pivots may be far off at first
 LOGIT_RATE, AXIS_RATE = 0.06, 0.05
 """Logits of parts, and of an axis of length 1 about its own direction, a step."""
-MEAN_SCALE_WEIGHT, MEAN_STATE_WEIGHT = 0.5, 0.02
-"""Of the squared mean log scales and states of all views, which the template can take over."""
+MEAN_SCALE_WEIGHT, MEAN_STATE_WEIGHT, MEAN_SHIFT_WEIGHT = 0.5, 0.02, 2.0
+"""Of the squared mean log scales, states and shifts of hinges of all views, which the template can
+take over."""
 MASS_WEIGHT, LEAST_MASS = 10.0, 0.06
 """Cost of a part with fewer than this share of the template's points."""
 FIRST_STATES = {"revolute": 1.7, "prismatic": 0.25}
@@ -113,6 +114,7 @@ def first_fit(
         if number == 0 and config.way_out and "prismatic" in kinds:
             placement = choose_axes(template, placement, torch.eye(3))
             axis_weight = config.axis_weight
+        placement = settle_hinges(template, placement)
         rebuild(template, views, placement, generator=generator)
     options = FitOptions(steps=LAST_STEPS, axis_weight=axis_weight)
     return bundle_adjust(template, views, placement, options, generator=generator)
@@ -147,6 +149,7 @@ def refit(
         placement, _ = bundle_adjust(
             template, views, placement, options, states=states, generator=generator
         )
+        placement = settle_hinges(template, placement)
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 
@@ -233,8 +236,7 @@ class _Free:
         self.log_scale = start.log_scale.detach().clone().requires_grad_()
         self.state = start.state.detach().clone().requires_grad_()
         self.shift = start.shift.detach().clone().requires_grad_()
-        self.slides = slides(template)
-        sliding = bool(self.slides.all())
+        sliding = bool(slides(template).all())
         self.groups = _groups(
             (self.turn, TURN_RATE),
             (self.translation, TRANSLATION_RATE),
@@ -250,7 +252,7 @@ class _Free:
             translation=self.translation,
             log_scale=self.log_scale,
             state=self.state,
-            shift=(self.shift - along) * self.slides,
+            shift=self.shift - along,
             deviation=self.start.deviation,
         )
 
@@ -270,7 +272,10 @@ def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOpti
     gauge = SCALE_WEIGHT * scale.square().sum(-1).mean()
     gauge = gauge + MEAN_SCALE_WEIGHT * scale.mean(0).square().sum()
     gauge = gauge + MEAN_STATE_WEIGHT * placement.state.mean(0).square().sum()
-    gauge = gauge + SHIFT_WEIGHT * placement.shift.square().sum((1, 2)).mean()
+    apart = torch.tensor([SHIFT_WEIGHT[kind] for kind in template.kinds]).to(scale)
+    gauge = gauge + (placement.shift.square().sum(-1) @ apart).mean()
+    hinged = 1 - slides(template)
+    gauge = gauge + MEAN_SHIFT_WEIGHT * (hinged * placement.shift.mean(0)).square().sum()
     spread = (placement.state - placement.state.mean(0)).square() @ slides(template)
     gauge = gauge + SLIDE_WEIGHT * spread.mean()
     askew = 1 - template.directions().square().amax(-1)

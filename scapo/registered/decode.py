@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -40,7 +41,7 @@ def placed_prediction(
         similarity: The normalisation to undo.
         confidence: Handed on.
     """
-    poses = _from_rest(template, placement)
+    poses = part_frames(template, placement)
     origin = template.part_centres()[0] * placement.log_scale.exp()
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
@@ -69,11 +70,16 @@ def metric_limits(
     return torch.where(slides(template) > 0, metric, ends - template.rest[:, None])
 
 
-def _from_rest(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
-    """view_T_part with frames that all parts share with the base when hinges are at their rest."""
+def part_frames(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
+    """view_T_part with frames that all parts share with the base when joints are at their rest.
+
+    Where a joint sits on the body moves its part, not that frame.
+    """
     poses = template.part_poses(placement)
     if not template.deviates():
-        return poses
+        shift = F.pad(placement.shift, (0, 0, 1, 0))
+        back = (poses.rotation @ shift[..., None])[..., 0]
+        return replace(poses, translation=poses.translation - back)
     rested = template.part_poses(_at_rest(template, placement))
     turn = poses.rotation @ rested.rotation.mT
     gap = placement.translation[:, None] - rested.translation

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from scapo.geometry.rigid import project_rotation
 from scapo.registered.pairwise import rotation_grid
-from scapo.registered.template import ArticulatedTemplate, Placement
+from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
 
 EDGE = 0.97  # Quantile of points that counts as the end of a body: single points say little
 OPEN = (0.1, 0.9)  # Quantiles of the views between which a part's way out of the body is measured
@@ -37,6 +37,10 @@ LOST = 0.2  # Where no direction of a frame has this share, the frame is sought 
 NEAR = 0.9  # Cosine of normals that count for it
 ASIDE = 0.3
 """Sine of the angle between an axis and the held direction from which on it tells the others."""
+REWEIGHTED, SPREAD = 10, 0.04
+"""Rounds of robust least squares, and the shift (normalised length) beyond which a view counts
+less."""
+LOOSE = 3e-4  # Pull of a hinge to its place, per view: what the views leave open stays
 
 
 @torch.no_grad()
@@ -193,3 +197,51 @@ def _turned_to(
     last = 3 - held - first
     rows[last] = torch.linalg.cross(rows[(last + 1) % 3], rows[(last + 2) % 3])
     return rows
+
+
+@torch.no_grad()
+def settle_hinges(template: ArticulatedTemplate, placement: Placement) -> Placement:
+    """Put every hinge where the observed motions of its part leave the least shift, in place.
+
+    A part that turns about one axis and is then shifted across it has turned about another, which
+    is parallel. While every object's hinge may sit elsewhere on its body, which of them is the
+    category's is open: it is that about which the shifts of all views are smallest (robust least
+    squares), with a constant displacement that the part's points take over.
+
+    Returns:
+        The same motions as turns about the new hinges, with the shifts that are left.
+    """
+    shift, scale = placement.shift.clone(), placement.log_scale.exp()
+    for j, kind in enumerate(template.kinds):
+        if kind != "revolute":
+            continue
+        axis = template.directions()[j]
+        turn = template.hinged(j, placement)
+        lever = torch.eye(3).to(turn) - turn
+        move = (lever @ (scale * template.pivot[j])[..., None])[..., 0] + shift[:, j]
+        across = across_axis(axis)
+        both = torch.cat([lever, turn], -1) * scale.repeat(1, 2)[:, None]
+        column = across @ both @ torch.block_diag(across.T, across.T)
+        start = torch.cat([across @ template.pivot[j], torch.zeros(2).to(scale)])
+        found = _robust_least_squares(column, move @ across.T, start)
+        pivot, moved = found[:2] @ across, found[2:] @ across
+        template.pivot[j] = pivot + (template.pivot[j] @ axis) * axis
+        template.points.add_(template.logit.softmax(-1)[:, j + 1, None] * moved)
+        left = move - (both @ torch.cat([template.pivot[j], moved])[:, None])[..., 0]
+        shift[:, j] = left - (left @ axis)[:, None] * axis
+    return replace(placement, shift=shift)
+
+
+def _robust_least_squares(
+    column: Float[Tensor, "B 2 D"], target: Float[Tensor, "B 2"], start: Float[Tensor, " D"]
+) -> Float[Tensor, " D"]:
+    """The x of least sum of log(1 + |column x - target|^2 / SPREAD^2), held near its start."""
+    found, hold = start, LOOSE * len(target)
+    for _ in range(REWEIGHTED):
+        off = target - column @ found
+        weight = 1 / (1 + (off / SPREAD).square().sum(-1))
+        rows = column * weight[:, None, None]
+        system = (rows.mT @ column).sum(0) + hold * torch.eye(len(start)).to(start)
+        right = (rows.mT @ target[..., None]).sum(0)[:, 0] + hold * start
+        found = torch.linalg.solve(system, right)
+    return found

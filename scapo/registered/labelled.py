@@ -27,7 +27,7 @@ from scapo.categories import JointKind
 from scapo.geometry.points import Similarity, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.records import take
-from scapo.registered.decode import canonical_surface, placed_prediction
+from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
 from scapo.registered.method import AbstractRegistered, LearnedClouds, SearchConfig
 from scapo.registered.pose_refinement import BACKWARD, RANKED
@@ -96,11 +96,9 @@ class LabelledRegistered(AbstractRegistered):
         similarity: Similarity,
         confidence: Float[Tensor, " B"],
     ) -> Prediction:
-        """Part frames are the object's at rest; where a part sits on the body moves no frame."""
+        """Part frames are the object's at rest."""
         plain = placed_prediction(self.template, placement, part_weight, similarity, confidence)
-        poses = self.template.part_poses(
-            replace(placement, shift=torch.zeros_like(placement.shift))
-        )
+        poses = part_frames(self.template, placement)
         scale = similarity.scale[:, None, None]
         return replace(
             plain,

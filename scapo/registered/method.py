@@ -64,7 +64,6 @@ from scapo.registered.pseudo_labels import PseudoLabels
 from scapo.registered.template import (
     ArticulatedTemplate,
     Placement,
-    slides,
     turn_placement,
 )
 from scapo.registered.view_bank import ShownPoints, ViewBank
@@ -323,7 +322,7 @@ class AbstractRegistered(AbstractMethod):
             translation=(frames.mT @ translation[..., None])[..., 0],
             log_scale=votes.log_scale,
             state=votes.state,
-            shift=votes.shift * slides(self.template),
+            shift=votes.shift,
             deviation=torch.zeros_like(votes.shift),
         )
         return placement, (votes, weight.mean(1).view(count, FRAMES))

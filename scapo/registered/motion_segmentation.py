@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from scapo.records import take
@@ -42,13 +43,16 @@ NEIGHBOUR, FLATNESS = 0.06, 3.0
 STIFFNESS = 10.0  # How far answers spread, against what each point says itself
 LEAST_COUNT, ALL_COUNT = 40, 6000
 """Points of a view that the template is built from, at least, and of all views together."""
-BASE_BONUS = 0.1
-"""Log support by which the base wins over a part: what nothing tells apart stays with it."""
+BASE_BONUS, LEAST_BONUS, LEAST_PART = 0.3, 0.1, 0.05
+"""Log support by which the base wins over a part, so that what nothing tells apart stays with it;
+that where it would leave a part with less than this share of the points."""
 SUPPORTED = 0.4  # Share of the views that must agree for a point to enter the template
 SEEN = 0.05  # Share of the observers that must have seen it, or more than one view
 LEAST_GOOD = 50  # Points without which the template stays as it was
 AVERAGED = 0.03
 """Reach (normalised length) of the mean that makes a template point of those about it."""
+GAP = 3.0  # Times the usual distance of template points within which they are one piece
+TAKEN = 1.0  # Logit by which the base wins points of other pieces of a part
 SURENESS = 6.0  # Logit of a part per unit of log support
 
 
@@ -161,8 +165,7 @@ def rebuild(
         observers=order[:OBSERVERS],
     )
     score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
-    score[..., 0] += BASE_BONUS
-    score = smooth(views, score)
+    score = favouring_base(smooth(views, score))
     part = score.argmax(-1)
     chosen = part[..., None, None].expand(*part.shape, 1, 3)
     points = evidence.points.gather(2, chosen)[:, :, 0].flatten(0, 1)
@@ -171,6 +174,15 @@ def rebuild(
     seen = evidence.seen.gather(2, part[..., None])[..., 0].flatten()
     good = (support > SUPPORTED) & (seen > max(1.0, SEEN * min(OBSERVERS, len(order))))
     _resample(template, points, normals, score.flatten(0, 1), support, good)
+
+
+def favouring_base(score: Float[Tensor, "B K P"]) -> Float[Tensor, "B K P"]:
+    """Log support with a bonus for the base: less where it would leave a part almost nothing."""
+    base = F.one_hot(torch.tensor(0), score.shape[-1]).to(score)
+    favoured = score + BASE_BONUS * base
+    count = favoured.argmax(-1).flatten().bincount(minlength=score.shape[-1])
+    scarce = bool(count.min() < LEAST_PART * count.sum())
+    return score + LEAST_BONUS * base if scarce else favoured
 
 
 def _resample(
@@ -192,4 +204,28 @@ def _resample(
     weight = torch.exp(-off / (2 * AVERAGED**2)) * support
     weight = weight / weight.sum(-1, keepdim=True)
     logit = SURENESS * weight @ score
-    template.assign(weight @ points, F.normalize(weight @ normals, dim=-1), logit)
+    points = weight @ points
+    template.assign(points, F.normalize(weight @ normals, dim=-1), in_one_piece(points, logit))
+
+
+def in_one_piece(points: Float[Tensor, "M 3"], logit: Float[Tensor, "M P"]) -> Float[Tensor, "M P"]:
+    """Part weights with all but the largest piece of each moving part given to the base.
+
+    A part is one rigid piece. What differs in place from object to object (a rear wall, what stands
+    on the body) may be explained a little better by a part's motion than by the base's, and would
+    then say of the joint what is not so.
+    """
+    part, logit = logit.argmax(-1), logit.clone()
+    off = torch.cdist(points, points)
+    apart = off.fill_diagonal_(torch.inf).amin(1).median()
+    linked = (off < GAP * apart).cpu().numpy()
+    for p in range(1, logit.shape[1]):
+        own = (part == p).nonzero()[:, 0]
+        if len(own) < 2:
+            continue
+        rows = own.cpu().numpy()
+        _, piece = connected_components(linked[rows][:, rows])
+        piece = torch.as_tensor(piece, device=own.device)
+        stray = own[piece != piece.bincount().argmax()]
+        logit[stray, 0] = logit[stray].amax(-1) + TAKEN
+    return logit

@@ -3,7 +3,7 @@
 
 The loss is `view_loss`; each step matches anew, weights every match by the slope of its robust
 distance, and solves one small linear system per placement: rotation, translation, three scales, the
-states, and for prismatic joints the place on the body. A handful of such steps does what
+states, and the places of joints on the body. A handful of such steps does what
 `bundle_adjust` does in four times as many. They do not leave a wrong state: `search_states` does.
 """
 
@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.categories import JointKind
 from scapo.geometry.points import gather
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
@@ -32,8 +33,9 @@ from scapo.registered.view_loss import (
 from scapo.registered.views import PartialViews
 
 SCALE_WEIGHT = 0.05  # Of the squared log scales
-SHIFT_WEIGHT = 0.2
-"""Of a sliding part's squared place across its axis, per squared normalised length."""
+SHIFT_WEIGHT: dict[JointKind, float] = {"revolute": 0.4, "prismatic": 0.2}
+"""Of a part's squared place across its joint's axis, per squared normalised length: drawers sit
+anywhere in a cabinet, hinges seldom far from where others have them."""
 SLIDE_WEIGHT = 0.7
 """Of a sliding joint's states about their mean: without it a part slides right through the body to
 explain its far side."""
@@ -151,7 +153,7 @@ class Motion:
 
     A part's point is affine in the template's (`Skin`), so is what any coordinate moves it by. The
     D coordinates: turn about the placement's origin (view axes), translation, log scales, states,
-    shifts of sliding joints.
+    shifts.
     """
 
     affine: Float[Tensor, "H Q 3"]
@@ -169,11 +171,7 @@ class Motion:
         columns = [_base_columns(template, placement, affine)]
         joints = range(len(template.kinds))
         columns += [_state_column(template, placement, j, affine) for j in joints]
-        columns += [
-            _shift_columns(template, placement, j, affine)
-            for j in joints
-            if template.kinds[j] == "prismatic"
-        ]
+        columns += [_shift_columns(template, placement, j, affine) for j in joints]
         return Motion(
             affine=affine.flatten(1, 2),
             turn=poses.rotation.mT.flatten(1, 2),
@@ -282,10 +280,8 @@ def _priors(
     value = [none, none, placement.log_scale, placement.state]
     weight = [0.0] * (POSE - 3) + [SCALE_WEIGHT] * 3
     weight += [SLIDE_WEIGHT * (kind == "prismatic") for kind in template.kinds]
-    for j, kind in enumerate(template.kinds):
-        if kind == "prismatic":
-            value.append(placement.shift[:, j])
-            weight += [SHIFT_WEIGHT] * 3
+    value.append(placement.shift.flatten(1))
+    weight += [SHIFT_WEIGHT[kind] for kind in template.kinds for _ in range(3)]
     return torch.tensor(weight).to(none), torch.cat(value, 1)
 
 
@@ -297,11 +293,10 @@ def _move(
     shift = placement.shift.clone()
     axis = template.directions()
     column = POSE + joints
-    for j, kind in enumerate(template.kinds):
-        if kind == "prismatic":
-            shift[:, j] += bounded(step[:, column : column + 3], MOST_MOVE)
-            shift[:, j] -= (shift[:, j] @ axis[j])[:, None] * axis[j]
-            column += 3
+    for j in range(joints):
+        shift[:, j] += bounded(step[:, column : column + 3], MOST_MOVE)
+        shift[:, j] -= (shift[:, j] @ axis[j])[:, None] * axis[j]
+        column += 3
     return replace(
         placement,
         rotation=rotvec_to_rotmat(turn) @ placement.rotation,

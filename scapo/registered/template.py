@@ -3,7 +3,7 @@
 
 One template per category: oriented points, part weights, joint axes and pivots, all in a template
 frame at state 0. A placement says where one cloud has it: pose of the base, joint states, three
-scales along the template's axes, and for prismatic joints where on the body the part sits.
+scales along the template's axes, and where on the body each joint sits.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Placement:
     state: Float[Tensor, "B J"]
     """Relative to the template's own state: rad or normalised length."""
     shift: Float[Tensor, "B J 3"]
-    """Of a joint and its part on the base, template frame, after scaling."""
+    """Of a joint and its part on the base, across its axis; template frame, after scaling."""
     deviation: Float[Tensor, "B J 3"]
     """Of a hinge's axis from the category's (rotation vector, template frame)."""
 
@@ -155,7 +155,7 @@ class ArticulatedTemplate(nn.Module):
         turn = rotvec_to_rotmat(placement.deviation)
         return (turn @ self.directions()[:, :, None])[..., 0]
 
-    def _hinged(self, j: int, placement: Placement) -> Float[Tensor, "B 3 3"]:
+    def hinged(self, j: int, placement: Placement) -> Float[Tensor, "B 3 3"]:
         """How hinge j turns its part: from its rest about its own axis (`axis_deviation`)."""
         axis, state = self.directions()[j], placement.state[:, j : j + 1]
         if not bool(placement.deviation[:, j].any()):
@@ -172,7 +172,7 @@ class ArticulatedTemplate(nn.Module):
         for j, kind in enumerate(self.kinds):
             step = axis[j] * placement.state[:, j : j + 1]
             if kind == "revolute":
-                turn = self._hinged(j, placement)
+                turn = self.hinged(j, placement)
                 move = pivot[:, j] - (turn @ pivot[:, j, :, None])[..., 0]
             else:
                 turn, move = torch.eye(3).to(step).expand(len(step), 3, 3), step
@@ -229,7 +229,7 @@ class ArticulatedTemplate(nn.Module):
 def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:
     """1 for each prismatic joint, 0 for the others."""
     sliding = [[float(kind == "prismatic")] for kind in template.kinds]
-    return torch.tensor(sliding).to(template.points)
+    return torch.tensor(sliding).view(-1, 1).to(template.points)
 
 
 def across_axis(axis: Float[Tensor, " 3"]) -> Float[Tensor, "2 3"]:

@@ -33,7 +33,9 @@ def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
     state = torch.tensor([[0.2], [0.7], [1.1]])
     placement = Placement.at(rotation, 0.1 * torch.randn(3, 3, generator=generator(2)), state)
     aside = deviation * torch.randn(3, 1, 3, generator=generator(3))
-    placement = replace(placement, deviation=aside)
+    across = torch.tensor([0.05, 0, -0.08])  # hinges sit elsewhere on each body
+    shift = torch.randn(3, 1, 3, generator=generator(4)) * across
+    placement = replace(placement, deviation=aside, shift=shift)
     shape = template()
     away = torch.tensor([0.1, 0.2, -0.1])  # part frames sit at the base's middle, not the origin
     shape.points.add_(away)
@@ -70,7 +72,7 @@ def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
     assert_close(turned[:, body], shape.place(placement)[1][:, body], atol=2e-3, rtol=0)
     assert (found.canonical_part == shape.logit.argmax(-1)).all()
     still = canonical_surface(shape, placement)[0]
-    assert_close(still[0], still[2], atol=1e-6, rtol=0)
+    assert_close(still[0, body], still[2, body], atol=2e-4, rtol=0)  # parts are blended a little
 
 
 def test_weights_come_from_the_part_that_is_there():

@@ -16,10 +16,11 @@ from scapo.registered.gauge import (
     choose_axes,
     principal_frame,
     protrusion,
+    settle_hinges,
     tells_frame,
 )
 from scapo.registered.template import ArticulatedTemplate, Placement
-from tests.helpers.sighted import AXIS, template
+from tests.helpers.sighted import AXIS, PIVOT, template
 from tests.helpers.sliding import OUT, UP, cabinet, placements
 from tests.helpers.strategies import generator
 
@@ -124,3 +125,44 @@ def test_the_frame_of_a_plate_follows_its_normal_and_its_hinge(degrees: float):
     assert plate.normals.abs().mean(0).max() > 0.98
     assert plate.directions()[0].abs().max() > 0.999
     assert_close(plate.place(found)[0], before, atol=1e-4, rtol=0)
+
+
+def hinged_elsewhere(count: int, seed: int) -> Placement:
+    """Views of objects of several sizes whose hinges sit about the template's own."""
+    g = generator(seed)
+    state = 1.4 * torch.rand(count, 1, generator=g) - 0.3
+    placement = Placement.at(random_rotations(count, g), torch.zeros(count, 3), state)
+    shift = 0.01 * torch.randn(count, 1, 3, generator=g)
+    shift[: count // 5] *= 20  # placed wrongly
+    return replace(
+        placement,
+        log_scale=0.2 * torch.randn(count, 3, generator=g),
+        shift=shift - (shift @ AXIS)[..., None] * AXIS,
+    )
+
+
+def test_a_hinge_settles_where_its_part_turns_without_shifts():
+    shape, placement = template(), hinged_elsewhere(200, 5)
+    before, _ = shape.place(placement)
+    aside = torch.tensor([0.15, 0.4, -0.1])
+    # the same motions told as turns about a hinge elsewhere, with shifts that make up for it
+    wrong = template()
+    with torch.no_grad():
+        wrong.pivot.add_(aside)
+    own = (wrong.hinged(0, placement) @ (placement.log_scale.exp() * aside)[..., None])[..., 0]
+    shift = placement.shift[:, 0] + own - placement.log_scale.exp() * aside
+    told = replace(placement, shift=(shift - (shift @ AXIS)[:, None] * AXIS)[:, None])
+    found = settle_hinges(wrong, told)
+    across = torch.tensor([1.0, 0.0, 1.0])
+    off = (wrong.pivot.detach()[0] - PIVOT) * across
+    assert off.norm() < 0.01 < 0.1 * (aside * across).norm()
+    assert_close(wrong.pivot.detach()[0, 1], PIVOT[1] + aside[1])
+    placed, _ = wrong.place(found)
+    assert_close(placed, before, atol=2e-4, rtol=0)
+    assert found.shift[40:].norm(dim=-1).mean() < 0.03 < told.shift[40:].norm(dim=-1).mean()
+
+
+def test_a_hinge_that_is_right_stays():
+    shape, placement = template(), hinged_elsewhere(200, 6)
+    settle_hinges(shape, replace(placement, shift=torch.zeros_like(placement.shift)))
+    assert_close(shape.pivot.detach()[0], PIVOT, atol=1e-4, rtol=0)

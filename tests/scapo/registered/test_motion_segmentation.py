@@ -5,7 +5,13 @@ from __future__ import annotations
 
 import torch
 
-from scapo.registered.motion_segmentation import gather_evidence, rebuild, smooth
+from scapo.registered.motion_segmentation import (
+    favouring_base,
+    gather_evidence,
+    in_one_piece,
+    rebuild,
+    smooth,
+)
 from scapo.registered.template import Placement
 from scapo.registered.view_loss import oriented_nearest
 from scapo.registered.views import PartialViews
@@ -49,3 +55,24 @@ def test_the_template_is_rebuilt_from_the_views():
     assert off.quantile(0.9) < 0.04
     parts = shape.logit.argmax(-1) == good.logit.argmax(-1)[index]
     assert parts.float().mean() > 0.8
+
+
+def test_a_part_is_one_piece():
+    g = generator(3)
+    flap = torch.rand(80, 3, generator=g) * torch.tensor([0.3, 0.3, 0.01])
+    wall = torch.rand(30, 3, generator=g) * torch.tensor([0.2, 0.01, 0.2]) + torch.tensor([1, 1, 1])
+    body = torch.rand(90, 3, generator=g) * 0.4 + torch.tensor([0.0, 0.0, 0.5])
+    logit = torch.tensor([0.0, 4.0]).repeat(200, 1)
+    logit[110:] = torch.tensor([4.0, 0.0])
+    part = in_one_piece(torch.cat([flap, wall, body]), logit).argmax(-1)
+    assert part.tolist() == [1] * 80 + [0] * 120
+    assert logit.argmax(-1).tolist() == [1] * 110 + [0] * 90
+
+
+def test_what_nothing_tells_apart_stays_with_the_base():
+    score = torch.zeros(1, 100, 2)
+    score[0, :40, 1] = 0.2  # a little for the part: more than the least bonus, less than the usual
+    score[0, :20, 1] = 1.0
+    assert (favouring_base(score).argmax(-1) == 1).sum() == 20
+    score[0, :20, 1] = 0.2  # the usual bonus would leave it nothing
+    assert (favouring_base(score).argmax(-1) == 1).sum() == 40
