@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # SPDX-License-Identifier: MIT
 # Resolve pyproject.toml into requirements.lock (what `make setup` installs) and requirements-all.lock (with [gpu-sim],
-# [cluster] and [kiss-matcher]), one file for all supported Pythons and platforms. Usage: scripts/lock.sh [--upgrade]
+# [cluster], [kiss-matcher] and [onnx]), one file for all supported Pythons and platforms. Usage: scripts/lock.sh [--upgrade]
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -29,7 +29,7 @@ compile() { # compile OUT HEADER ARGUMENTS...
 if [ "${1:-}" != --upgrade ] && [ -e requirements-all.lock ]; then
   cp requirements-all.lock "$work/requirements-all.lock" # versions already locked are kept where they still fit
 fi
-compile requirements-all.lock "all extras and the dev group" --extra gpu-sim --extra cluster --extra kiss-matcher
+compile requirements-all.lock "all extras and the dev group" --extra gpu-sim --extra cluster --extra kiss-matcher --extra onnx
 cp requirements-all.lock "$work/all.txt"
 compile requirements.lock "[sim], [bench], [view] and the dev group" --constraint "$work/all.txt"
 wc -l requirements.lock requirements-all.lock

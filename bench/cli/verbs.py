@@ -257,6 +257,17 @@ class Calibrate(requests.CalibrateRequest):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Demo(requests.DemoRequest):
+    """A local page where a file is dropped and what infer makes of it appears."""
+
+    def run(self, console: Console) -> None:
+        """Serve until Ctrl-C."""
+        from bench.infer.server import serve
+
+        serve(self, lambda line: say(console, line))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Release(requests.ReleaseRequest):
     """Make a small checkpoint of a finished run, with its card, for scapo.load and infer."""
 
@@ -282,6 +293,7 @@ VERBS: dict[str, Any] = {
     "release": Release,
     "infer": Infer,
     "calibrate": Calibrate,
+    "demo": Demo,
 }
 """In the order of the help, where `train` stands without its methods."""
 

@@ -143,13 +143,17 @@ class Grid:
 
         Raises:
             StoreError: Another run goes on in this folder.
+            KeyboardInterrupt: With what to do next.
         """
+        done = execute(plan, status.chains, self.out, self.data, self.machines, status.hear)
         with _alone(self.out):
-            for name, ended in execute(
-                plan, status.chains, self.out, self.data, self.machines, status.hear
-            ):
-                status.end(name, ended)
-                yield name, ended
+            try:
+                for name, ended in done:
+                    status.end(name, ended)
+                    yield name, ended
+            except KeyboardInterrupt as stop:
+                words = f"{self.out}: interrupted; the same command goes on from here"
+                raise KeyboardInterrupt(words) from stop
 
     def tables(self, plan: Plan) -> list[Path]:
         """The tables of all scores that are there, and the page of them; none without scores.

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from bench.requests import Mode
+from bench.twin.export import write_twin
+from bench.twin.page import write_page
 from bench.twin.record import BACKGROUND, Twin
 from scapo.drawing import BACKGROUND as BACKGROUND_COLOR
 from scapo.drawing import PART_COLORS
@@ -152,5 +154,8 @@ def write_result(result: Result, folder: Path) -> list[str]:
     with whole_folder(folder) as temporary:
         (temporary / JOINTS).write_text(text, encoding="utf-8")
         (temporary / PARTS).write_bytes(parts_ply(result.twin))
+        twin = write_twin(result.twin, temporary / OBJECT)
+        own = (temporary / JOINTS, temporary / PARTS)
+        write_page(result.twin, temporary / PAGE, (*own, *twin))
         made = sorted(path for path in temporary.rglob("*") if path.is_file())
         return [path.relative_to(temporary).as_posix() for path in made]

@@ -140,11 +140,24 @@ def test_what_cannot_be_asked(flag: list[str], message: str, tmp_path: Path, cap
 
 @pytest.mark.slow
 @pytest.mark.render
-def test_smoke(tmp_path: Path, capsys):
-    program.main(["run", "smoke", "--out", str(tmp_path / "out")])
+def test_a_method_of_smoke_from_nothing_to_its_row(tmp_path: Path, capsys):
+    words = ["run", "smoke", "--out", str(tmp_path / "out"), "--only", "scapo"]
+    program.main(words)
     table = (tmp_path / "out" / "tables" / "table1.csv").read_text()
-    for method in ("PointNet++ (cpu)", "ICP", "SCAPO (cpu)"):
-        assert f",{method},ours," in table
+    assert ",SCAPO (cpu),ours," in table
+    assert ",Oracle pose,ours," in table
+    assert (tmp_path / "out" / "tables" / "index.html").is_file()
     capsys.readouterr()
-    program.main(["run", "smoke", "--out", str(tmp_path / "out")])
+    program.main(words)
     assert "clean/oven/scapo/seed1: 6 kept" in capsys.readouterr().out
+
+
+def test_what_is_interrupted_says_how_to_go_on(folder: Path, monkeypatch):
+    make_splits(folder)
+
+    def stopped(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(run, "execute", lambda *args: map(stopped, [1]))
+    with pytest.raises(KeyboardInterrupt, match="the same command goes on from here"):
+        said(words(folder))

@@ -35,7 +35,8 @@ def result() -> Result:
 
 def test_the_record_says_what_was_found(result, tmp_path):
     files = write_result(result, tmp_path / "kitchen")
-    assert {"joints.json", "parts.ply"} <= set(files)
+    wanted = {"joints.json", "parts.ply", "page.html", "object/mobility.urdf", "object/twin.glb"}
+    assert wanted <= set(files)
     record = json.loads((tmp_path / "kitchen" / "joints.json").read_text())
     assert record["format"] == "scapo-joints/1"
     assert record["category"]["margin"] == pytest.approx(0.2)

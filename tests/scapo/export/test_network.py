@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""The network of the registration method answers alike as a graph and as an ONNX file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from scapo.export.network import export_network, write_onnx
+from scapo.registered.network import PlainVotes, PointVotes
+from tests.helpers.strategies import generator
+
+
+def network() -> PointVotes:
+    made = PointVotes(2, 1, width=8).eval()
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.copy_(0.3 * torch.randn(parameter.shape, generator=generator(0)))
+    return made
+
+
+def clouds(count: int) -> torch.Tensor:
+    return 0.2 * torch.randn(count, 40, 3, generator=generator(count))
+
+
+@torch.no_grad()
+def test_plain_operations_give_the_votes():
+    made = network()
+    for name, found in zip(PlainVotes.OUTPUTS, PlainVotes(made)(clouds(3)), strict=True):
+        assert_close(found, getattr(made(clouds(3)), name), atol=1e-5, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_the_graph_gives_the_votes_for_any_number_of_clouds():
+    made = network()
+    graph = export_network(PlainVotes(made), clouds(2)).module()
+    for count in (1, 2, 5):
+        wanted = made(clouds(count))
+        for name, found in zip(PlainVotes.OUTPUTS, graph(clouds(count)), strict=True):
+            assert_close(found, getattr(wanted, name), atol=1e-4, rtol=0)
+
+
+@pytest.mark.slow
+@torch.no_grad()
+def test_the_onnx_file_gives_the_votes(tmp_path: Path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    made, path = network(), tmp_path / "votes.onnx"
+    write_onnx(PlainVotes(made), clouds(2), PlainVotes.OUTPUTS, path)
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    assert [item.name for item in session.get_outputs()] == list(PlainVotes.OUTPUTS)
+    for count in (1, 4):
+        wanted = made(clouds(count))
+        answers = session.run(None, {"cloud": clouds(count).numpy()})
+        for name, found in zip(PlainVotes.OUTPUTS, answers, strict=True):
+            assert_close(torch.from_numpy(found), getattr(wanted, name), atol=1e-4, rtol=0)
