@@ -54,7 +54,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             config=(
                 tyro.conf.OmitSubcommandPrefixes,
                 tyro.conf.CascadeSubcommandArgs,
-                tyro.conf.FlagCreatePairsOff,
             ),
         )
         command.run(console)
