@@ -54,7 +54,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             config=(
                 tyro.conf.OmitSubcommandPrefixes,
                 tyro.conf.CascadeSubcommandArgs,
-                tyro.conf.FlagCreatePairsOff,
             ),
         )
         command.run(console)
@@ -65,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         say(errors, f"scapo-bench: {error}")
         sys.exit(1)
     except KeyboardInterrupt as stop:
-        say(errors, f"scapo-bench: {stop or 'interrupted'}")
+        say(errors, f"scapo-bench: {str(stop) or 'interrupted'}")
         sys.exit(130)
 
 

@@ -10,9 +10,12 @@ oven doors to 90, glasses fold to about 80, drawers pull out most of their depth
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from math import radians
 from typing import Literal
+
+from scapo.text import did_you_mean, is_word
 
 JointKind = Literal["revolute", "prismatic"]
 RestRule = Literal["smallest-box", "largest-box", "tallest"]
@@ -54,16 +57,76 @@ class Category:
     name: str
     parts: tuple[str, ...]
     joints: tuple[JointSpec, ...]
-    benchmark: tuple[Literal["clean", "sensor"], ...]
-    symmetry: Matrix3 | None
-    """Rotation A of the object frame that exchanges the parts (docs/data-format.md), or None."""
     window: Window
     diagonal: float
     """Nominal diagonal of the box at rest in metres, for models without metric size."""
-    rest: RestRule
+    benchmark: tuple[Literal["clean", "sensor"], ...] = ()
+    symmetry: Matrix3 | None = None
+    """Rotation A of the object frame that exchanges the parts (docs/data-format.md), or None."""
+    rest: RestRule = "smallest-box"
     """Which joint limit is rest, for models that do not say: the one with this bounding box."""
-    words: tuple[str, ...]
+    words: tuple[str, ...] = ()
     """Link or semantic names that tell the moving parts of this category."""
+
+
+def check_category(kind: Category) -> None:
+    """Refuse what cannot be: categories that others define come with mistakes.
+
+    Raises:
+        ValueError: `field: expected, found`.
+    """
+    if not is_word(kind.name):
+        raise ValueError(f"name: expected a folder's name, found {kind.name!r}")
+    if len(kind.parts) != len(kind.joints) + 1 or not kind.joints:
+        raise ValueError(
+            f"parts: expected two or more, one more than joints, found {len(kind.parts)} parts "
+            f"and {len(kind.joints)} joints"
+        )
+    if len(set(kind.parts)) < len(kind.parts) or not all(map(is_word, kind.parts)):
+        raise ValueError(f"parts: expected different names, found {', '.join(kind.parts)}")
+    for j, joint in enumerate(kind.joints):
+        _check_joint(joint, j)
+    if not 0 < kind.diagonal < math.inf:
+        raise ValueError(f"diagonal: expected metres above 0, found {kind.diagonal}")
+    _check_window(kind.window)
+    if kind.symmetry is not None and not _is_rotation(kind.symmetry):
+        raise ValueError(f"symmetry: expected a rotation, found {kind.symmetry}")
+
+
+def _check_joint(joint: JointSpec, j: int) -> None:
+    if (joint.parent, joint.child) != (0, j + 1):
+        raise ValueError(
+            f"joints[{j}]: expected parent 0 and child {j + 1}, found {joint.parent} and "
+            f"{joint.child}"
+        )
+    if not 0 <= joint.lower < joint.upper < math.inf:
+        raise ValueError(
+            f"joints[{j}]: expected 0 <= lower < upper, found {joint.lower} and {joint.upper}"
+        )
+
+
+def _check_window(window: Window) -> None:
+    for name, ends, most in (
+        ("azimuth", window.azimuth, 180.0),
+        ("elevation", window.elevation, 90.0),
+    ):
+        if not -most <= ends[0] < ends[1] <= most:
+            raise ValueError(
+                f"window.{name}: expected rising degrees from -{most:g} to {most:g}, found "
+                f"{ends[0]:g} and {ends[1]:g}"
+            )
+
+
+def _is_rotation(rows: Matrix3) -> bool:
+    """Whether the rows are orthonormal and right-handed, to a millionth."""
+    a, b, c = rows
+    products = [sum(x * y for x, y in zip(u, v, strict=True)) for u in rows for v in rows]
+    cross = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
+    turned = sum(x * y for x, y in zip(a, cross, strict=True))
+    unit = (1, 0, 0, 0, 1, 0, 0, 0, 1)
+    return abs(turned - 1) < 1e-6 and all(
+        abs(x - y) < 1e-6 for x, y in zip(products, unit, strict=True)
+    )
 
 
 TURN_X: Matrix3 = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
@@ -195,5 +258,8 @@ def category(name: str) -> Category:
         ValueError: The name is not listed; the message lists those that are.
     """
     if name not in CATEGORIES:
-        raise ValueError(f"category {name!r}: expected one of {', '.join(CATEGORIES)}")
+        raise ValueError(
+            f"category {name!r}: expected one of {', '.join(CATEGORIES)}"
+            f"{did_you_mean(name, CATEGORIES)}"
+        )
     return CATEGORIES[name]

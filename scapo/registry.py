@@ -75,7 +75,12 @@ LIBRARY: dict[str, Method] = {
         title="SCAPO",
         rank=70,
         maker="scapo.paper.method:Scapo",
-        presets={"paper": "scapo.paper.method:ScapoConfig", "cpu": "scapo.paper.method:cpu_config"},
+        presets={
+            "paper": "scapo.paper.config:ScapoConfig",
+            "literal": "scapo.paper.config:literal_config",
+            "cpu": "scapo.paper.config:cpu_config",
+            "complete": "scapo.paper.config:complete_config",
+        },
     ),
     "registered": Method(
         title="SCAPO, registered",
@@ -138,19 +143,29 @@ def load_method(
     """
     import torch
 
-    from scapo.categories import category
-    from scapo.store.checkpoint import config_from, load_arrays, read_checkpoint
+    from scapo.store.checkpoint import (
+        check_header,
+        config_from,
+        header_category,
+        load_arrays,
+        read_checkpoint,
+    )
     from scapo.store.schema import StoreError
+    from scapo.text import did_you_mean
 
     methods = known() if methods is None else methods
     arrays, header = read_checkpoint(path)
     name = header["method"]
     if name not in methods:
-        raise StoreError(f"{path}: expected a method of {', '.join(methods)}, found {name!r}")
+        close = did_you_mean(name, methods)
+        raise StoreError(
+            f"{path}: expected a method of {', '.join(methods)}, found {name!r}{close}"
+        )
     entry = methods[name]
     config = config_from(entry.kind, header["config"], f"{path}: config")
+    kind = header_category(check_header(header, str(path)), str(path))
     try:
-        method = entry.build(config, category(header["category"]), torch.Generator())
+        method = entry.build(config, kind, torch.Generator())
     except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
         words = " ".join(str(error).split())
         raise StoreError(f"{path}: config: expected one that builds, found {words}") from error

@@ -7,6 +7,8 @@ What a file says of itself may hold line breaks, escape sequences, markup or a m
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 LONGEST = 2000
 """Characters of a message; of longer text the middle is left out."""
@@ -47,6 +49,16 @@ def is_word(text: str) -> bool:
     """
     plain = text.isprintable() and not set(text) & set("/\\")
     return plain and 0 < len(text) <= LONGEST_WORD and not text.startswith(".")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The end of a message about a name that is not known, where one that is looks like it.
+
+    >>> did_you_mean("lapto", ["oven", "laptop"]), did_you_mean("teapot", ["oven"])
+    ("; did you mean 'laptop'?", '')
+    """
+    close = get_close_matches(name[:LONGEST_WORD].lower(), list(known), 1)
+    return f"; did you mean {close[0]!r}?" if close else ""
 
 
 def as_cell(text: str) -> str:

@@ -7,16 +7,17 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from scapo.categories import Category
     from scapo.types import Sample
 
 __all__ = ["generate_samples"]
 
 
-def generate_samples(category: str, **options: Any) -> Iterator[Sample]:  # noqa: ANN401
+def generate_samples(category: str | Category, **options: Any) -> Iterator[Sample]:  # noqa: ANN401
     """Yield the samples that `scapo-data generate` would write, without touching the disk.
 
     Args:
-        category: One of `scapo.CATEGORIES`.
+        category: One of `scapo.CATEGORIES` by its name, or a category of your own.
         options: The fields of `sim_assets.options.DataOptions`: count, instances, seed, split,
             points, protocol, backend, source, ...
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.text import Text
 
 from scapo.text import one_line
-from sim_assets.cli.verbs import VERBS
+from sim_assets.cli.verbs import VERBS, UsageError
 
 DESCRIPTION = (
     "Make and look at labelled point clouds of articulated objects (--version: of which release)."
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             prog="scapo-data",
             description=DESCRIPTION,
             args=words,
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(tyro.conf.OmitArgPrefixes,),
         )
         sys.exit(command.run(console))
     except MemoryError as error:
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(1)
     except (ValueError, OSError, RuntimeError) as error:
         _say(errors, f"scapo-data: {error}")
-        sys.exit(1)
+        sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:
         _say(errors, "scapo-data: stopped; the same command takes it up where it was")
         sys.exit(130)

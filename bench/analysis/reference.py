@@ -22,6 +22,7 @@ from bench.requests import Kind
 from bench.scoring.truth import Truth, blocks, revolute
 from scapo.geometry import rigid as geometry
 from scapo.store import Arrays, Split, open_split
+from scapo.store.definitions import foreign, known_category
 from scapo.store.predictions import Header, write_predictions
 
 RECIPE = "scapo-reference/1"
@@ -78,12 +79,14 @@ def write_answers(kind: Kind, train: Split, test: Split, out: Path) -> None:
     means = learn(kind, train)
     parts = [_answer(kind, truth, means, turns) for truth in blocks(test)]
     arrays: Arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    known = known_category(test.manifest)
     header = Header(
         method=kind, variant="", category=test.manifest.category, split=test.manifest.split,
         seed=0, data_digest=test.manifest.digest, supervision=("joint", "pose", "segmentation"),
         camera=False,
         budget={"training clouds": train.manifest.count, "training": "means of the labels"},
         run={"data_digest": train.manifest.digest, "recipe": RECIPE},
+        definition=None if known is None else foreign(known),
     )  # fmt: skip
     write_predictions(out, header, arrays)
 

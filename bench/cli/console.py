@@ -29,6 +29,7 @@ from scapo.text import one_line
 if TYPE_CHECKING:
     from bench.grid.execute import Ended
     from bench.grid.run import Status
+    from bench.tables.model import Table as ResultsTable
     from scapo.training.fit import Progress as Position
 
 Item = TypeVar("Item")
@@ -144,6 +145,25 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s"
+
+
+def results_table(made: ResultsTable) -> Table:
+    """A table of results as rows of text, without its notes."""
+    table = _table(f"Table {made.number}. {made.title}.")
+    groups = [name for name, width in made.groups for _ in range(width)]
+    for heading in (made.first, "Method"):
+        table.add_column(Text(heading))
+    for k, heading in enumerate(made.columns):
+        group = f"{groups[k]} " if groups else ""
+        table.add_column(Text(one_line(f"{group}{heading}")), justify="right")
+    for block in made.blocks:
+        first = block.heading
+        for row in block.rows:
+            name = row.method if row.source == "ours" else f"{row.method} (paper)"
+            cells = [f"{cell.shown}*" if cell.best else cell.shown for cell in row.cells]
+            table.add_row(*(Text(one_line(text)) for text in (first, name, *cells)))
+            first = ""
+    return table
 
 
 TITLES = {"none": "not moved", "rotation": "turned", "translation": "shifted", "both": "both"}

@@ -18,6 +18,7 @@ from bench import requests
 from bench.cli.console import (
     chain_line,
     in_words,
+    results_table,
     say,
     shown,
     stability_tables,
@@ -92,19 +93,23 @@ class Tables:
     """How the parts of a sample join in the average precision of Table 2."""
     html: bool = False
     """Also write index.html: the tables as a leaderboard that a browser opens from disk."""
+    only_ours: bool = False
+    """Only our rows, without the paper's printed numbers."""
     check_paper: bool = False
     """Only list what does not add up in the paper's printed tables; writes nothing."""
 
     def run(self, console: Console) -> None:
-        """Write the tables, or check the printed ones."""
+        """Write the tables and print those that have rows of ours, or check the printed ones."""
         from bench.tables.paper import check
         from bench.tables.write import make_tables
 
-        lines = (
-            check()
-            if self.check_paper
-            else make_tables(self.scores, self.out, self.ap_rule, self.split, page=self.html)
-        )
+        if self.check_paper:
+            lines: list[object] = [*check()]
+        else:
+            made = make_tables(self.scores, self.ap_rule, self.split, only_ours=self.only_ours)
+            lines = [*made.write(self.out, page=self.html)]
+            for table in made.with_ours():
+                console.print(results_table(table))
         for line in lines:
             say(console, line)
 

@@ -10,7 +10,7 @@ from bench.infer.alignment import Alignment
 from bench.infer.calibration import Calibration, calibration_file, read_calibration
 from bench.methods import load
 from bench.requests import Mode
-from scapo.categories import CATEGORIES, Category
+from scapo.categories import Category
 from scapo.predictor import Predictor, find, released
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.files import sha256_file
@@ -62,7 +62,7 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
     return Model(
         name=file.resolve().parent.name if file.name == WEIGHTS else file.stem,
         predictor=Predictor(method, device),
-        category=CATEGORIES[header["category"]],
+        category=method.category,
         method=header["method"],
         digest=digest,
         calibration=read_calibration(beside, digest) if beside and beside.is_file() else None,

@@ -20,6 +20,7 @@ from scapo.method import AbstractMethod, OracleMethod, evenly
 from scapo.records import map_tensors
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import require_fields
+from scapo.store.definitions import foreign
 from scapo.store.files import Arrays
 from scapo.store.files import Header as StoredHeader
 from scapo.store.predictions import Header, write_predictions
@@ -96,6 +97,7 @@ def _made(
         camera=None if entry is None else entry.camera,
         budget=budget,
         run={name: header[name] for name in RUN_FIELDS if name in header},
+        definition=foreign(method.category),
     )
 
 

@@ -16,8 +16,9 @@ from bench.requests import TrainRequest
 from bench.run_files import TIMING
 from bench.runs.report import REPORT, write_report
 from scapo.categories import category
-from scapo.store import open_split
+from scapo.store import Split, open_split
 from scapo.store.checkpoint import WEIGHTS
+from scapo.store.definitions import category_of
 from scapo.store.samples import TrainingData, read_training_data
 from scapo.store.schema import StoreError
 from scapo.training import fit
@@ -65,8 +66,8 @@ def _fit(
     """Read the split, build the method and fit it."""
     methods, config_type = all_methods(), type(request.method)
     name = next(name for name, entry in methods.items() if entry.kind is config_type)
-    kind = category(request.category)
-    split = open_split(request.data, request.category, request.split)
+    split = _training_split(request)
+    kind = category_of(split.manifest)
     generator = torch.Generator().manual_seed(request.seed)
     method = methods[name].build(request.method, kind, generator)
     if method.name != name:
@@ -92,6 +93,20 @@ def _fit(
     logging.getLogger("scapo").setLevel(logging.WARNING if say is None else logging.INFO)
     shown = fit.silent if say is None else listener
     fit.fit(method, data, request.out, config, resume=request.resume, listener=shown)
+
+
+def _training_split(request: TrainRequest[Any]) -> Split:
+    """The split to train on.
+
+    Raises:
+        StoreError: The data have none of that category.
+        ValueError: Neither have they, nor is there such a category.
+    """
+    try:
+        return open_split(request.data, request.category, request.split)
+    except StoreError:
+        category(request.category)  # a name that nobody knows is the likelier mistake
+        raise
 
 
 def _validation(request: TrainRequest[Any]) -> TrainingData | None:

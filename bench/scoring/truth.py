@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError, safe_open
 
-from scapo.categories import CATEGORIES
 from scapo.store import SAMPLES, Split, StoreError, read_header
+from scapo.store.definitions import known_category
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
 
@@ -71,7 +71,7 @@ class Truth:
 
 def symmetry(manifest: Manifest) -> Float[np.ndarray, "3 3"] | None:
     """The rotation of the object frame that exchanges the parts, None where there is none."""
-    known = CATEGORIES.get(manifest.category)
+    known = known_category(manifest)
     if known is None or known.symmetry is None:
         return None
     return np.array(known.symmetry, np.float64)
@@ -128,11 +128,17 @@ def _truth(path: Path, first: int, rows: dict[str, np.ndarray]) -> Truth:
     points = rows["points"]
     centred = points - points.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
     radius = np.sqrt(np.einsum("bnc,bnc->bn", centred, centred)).mean(1, dtype=np.float64)
+    odd = ~np.isfinite(points).all((1, 2))
+    if odd.any():
+        what = "NaN" if np.isnan(points[odd.argmax()]).any() else "infinite coordinates"
+        raise StoreError(
+            f"{path}: sample {first + int(odd.argmax())}: expected finite points, found {what}"
+        )
     usable = np.isfinite(radius) & (radius > 0)
     if not usable.all():
         raise StoreError(
             f"{path}: sample {first + int(usable.argmin())}: expected finite points "
-            "that differ, found mean radius 0 or NaN"
+            "that differ, found mean radius 0"
         )
     part = rows["part"].astype(np.int16)
     part[part == UNLABELLED] = -1

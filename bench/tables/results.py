@@ -137,7 +137,9 @@ def load(folder: Path, split: str = TABLE_SPLIT) -> Results:
         StoreError: No such folder, a file that is no scores file, or scores or a report alone.
     """
     if not folder.is_dir():
-        raise StoreError(f"{folder}: expected a folder of scores, found none")
+        raise StoreError(
+            f"{folder}: expected a folder of scores, found none; `scapo-bench evaluate` writes them"
+        )
     files = sorted(folder.rglob(f"*{SUFFIX}"))
     alone = {path for path in folder.rglob("*.json") if is_report(path)} - set(
         map(side_file, files)

@@ -7,7 +7,8 @@ and 4 to 7 are ours alone (`bench.tables.means`, `bench.tables.actuation`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bench.metrics import ApRule
@@ -22,7 +23,7 @@ from bench.tables.results import TABLE_SPLIT, Place, Results, averaged, load, me
 from bench.tables.rows import Line, budget_notes, general_notes, line_row, lines_of
 from bench.tables.significance import significance_csv
 from bench.tables.spec import ABLATION_NAMES, ABLATIONS, TABLE_1_CATEGORIES, TABLE_3
-from scapo.store import write_bytes
+from scapo.store import StoreError, write_bytes
 
 
 def build(results: Results, rule: ApRule = "mean") -> tuple[Table, ...]:
@@ -41,43 +42,73 @@ def build(results: Results, rule: ApRule = "mean") -> tuple[Table, ...]:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Made:
+    """Scores, and the tables that are made of them."""
+
+    scores: Path
+    results: Results
+    tables: tuple[Table, ...]
+    rule: ApRule
+
+    def with_ours(self) -> Iterator[Table]:
+        """The tables that have a row of ours."""
+        for table in self.tables:
+            if any(row.source == "ours" for block in table.blocks for row in block.rows):
+                yield table
+
+    def write(self, out: Path, *, page: bool = False) -> list[Path]:
+        """Write `tableNUMBER.{md,csv,tex}` and `significance.csv`, and the leaderboard if wanted.
+
+        Returns:
+            Their paths.
+        """
+        written: dict[Path, str] = {}
+        for table in self.tables:
+            stem = f"table{table.number}"
+            written[out / f"{stem}.md"] = to_markdown(table)
+            written[out / f"{stem}.csv"] = to_csv(table)
+            written[out / f"{stem}.tex"] = to_latex(table)
+        written[out / "significance.csv"] = significance_csv(self.results, self.rule)
+        if page:
+            written[out / PAGE] = to_html(self.tables, self.results, self.scores, out)
+        for path, text in written.items():
+            write_bytes(path, text.encode())
+        return list(written)
+
+
 def make_tables(
-    scores: Path,
-    out: Path,
-    rule: ApRule = "mean",
-    split: str = TABLE_SPLIT,
-    *,
-    page: bool = False,
-) -> list[Path]:
-    """Write `tableNUMBER.{md,csv,tex}` of all tables and `significance.csv` from scores.
+    scores: Path, rule: ApRule = "mean", split: str = TABLE_SPLIT, *, only_ours: bool = False
+) -> Made:
+    """All tables from scores.
 
     Args:
         scores: Folder that is searched for them.
-        out: Folder for the tables.
         rule: Of the average precision.
         split: Of all tables but 6.
-        page: Also write the leaderboard, `index.html`.
-
-    Returns:
-        Their paths.
+        only_ours: Leave the paper's printed rows out.
 
     Raises:
-        StoreError: No such folder, or scores that are damaged or do not fit together.
+        StoreError: No such folder, none in it, or scores that are damaged or do not fit together.
     """
-    results = load(scores, split)
-    written: dict[Path, str] = {}
-    tables = (*build(results, rule), table_7(load_actuations(scores, split)))
-    for table in tables:
-        stem = f"table{table.number}"
-        written[out / f"{stem}.md"] = to_markdown(table)
-        written[out / f"{stem}.csv"] = to_csv(table)
-        written[out / f"{stem}.tex"] = to_latex(table)
-    written[out / "significance.csv"] = significance_csv(results, rule)
-    if page:
-        written[out / PAGE] = to_html(tables, results, scores, out)
-    for path, text in written.items():
-        write_bytes(path, text.encode())
-    return list(written)
+    results, actuations = load(scores, split), load_actuations(scores, split)
+    if not results.all_runs() and not actuations:
+        raise StoreError(
+            f"{scores}: expected scores on {split} (NAME.csv.gz), found none; "
+            "`scapo-bench evaluate` writes them"
+        )
+    tables = (*build(results, rule), table_7(actuations))
+    tables = tuple(map(ours_of, tables)) if only_ours else tables
+    return Made(scores=scores, results=results, tables=tables, rule=rule)
+
+
+def ours_of(table: Table) -> Table:
+    """The table without the paper's rows, and without blocks that are then empty."""
+    blocks = [
+        replace(block, rows=tuple(row for row in block.rows if row.source == "ours"))
+        for block in table.blocks
+    ]
+    return replace(table, blocks=tuple(block for block in blocks if block.rows))
 
 
 def table_3(results: Results, cells: Cells) -> Table:

@@ -3,13 +3,16 @@
 
 A URDF has no default state: simulators load it with all joints at 0. The observed state stands in
 `twin.json` beside it, by joint, with the root link's pose in the camera's frame (`camera_T_root`);
-the GLB shows the object in that state. Each part collides as its convex hull, which simulators do
-not test between a link and the one that it hangs on.
+the GLB shows the object in that state. Each part collides as its convex hull, and with the rest of
+the world only: `mobility.srdf`, which SAPIEN reads by itself, says so, since hulls overlap where
+parts meet or fold over each other.
 """
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from bench.twin.articulated import articulated, link_name
 from bench.twin.record import Twin
@@ -18,12 +21,11 @@ from scapo.export.urdf import write_files
 from scapo.store import canonical_json, write_bytes
 
 FORMAT = "scapo-twin/1"
-GLB = "twin.glb"
-STATE = "twin.json"
+SRDF, GLB, STATE = "mobility.srdf", "twin.glb", "twin.json"
 
 
 def write_twin(twin: Twin, folder: Path) -> list[Path]:
-    """Write `mobility.urdf`, `meshes/*.obj`, `twin.glb` and `twin.json` into a folder.
+    """Write `mobility.urdf`, its meshes and SRDF, `twin.glb` and `twin.json` into a folder.
 
     Equal twins give equal bytes.
 
@@ -40,7 +42,9 @@ def write_twin(twin: Twin, folder: Path) -> list[Path]:
     """
     made = articulated(twin)
     folder.mkdir(parents=True, exist_ok=True)
-    files = write_files(folder, made.links, made.joints, link_name(twin.category.name))
+    name = link_name(twin.category.name)
+    files = write_files(folder, made.links, made.joints, name)
+    write_bytes(folder / SRDF, _srdf(name, [link.name for link in made.links]).encode())
     write_glb(folder / GLB, made.links, made.joints, made.state)
     text = canonical_json(
         {
@@ -53,4 +57,13 @@ def write_twin(twin: Twin, folder: Path) -> list[Path]:
         }
     )
     write_bytes(folder / STATE, (text + "\n").encode())
-    return [*files, folder / GLB, folder / STATE]
+    return [*files, folder / SRDF, folder / GLB, folder / STATE]
+
+
+def _srdf(name: str, links: list[str]) -> str:
+    """That no two links collide with each other: SAPIEN heeds the reason `Default` only."""
+    robot = Element("robot", name=name)
+    for first, second in combinations(links, 2):
+        SubElement(robot, "disable_collisions", link1=first, link2=second, reason="Default")
+    indent(robot)
+    return '<?xml version="1.0"?>\n' + tostring(robot, encoding="unicode") + "\n"

@@ -162,7 +162,7 @@ def _table(caption: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) ->
 
 def _files(downloads: Sequence[Path]) -> str:
     """Links that carry the files themselves."""
-    urdf = [path for path in downloads if path.suffix in (".urdf", ".obj")]
+    urdf = [path for path in downloads if path.suffix in (".urdf", ".srdf", ".obj")]
     carried = [("urdf.zip", _zip(urdf))] if urdf else []
     carried += [(path.name, path.read_bytes()) for path in downloads if path not in urdf]
     items = "".join(f"<li>{_download(name, content)}</li>" for name, content in carried)

@@ -28,6 +28,10 @@ SPACING = 0.9
 """Quantile of the distances to the third nearest point that counts as the points' spacing."""
 LEAST_SPACING = 0.005
 """Of the part's diagonal: repeated points are no finer sampling."""
+NOISY = 0.25
+"""Spacings of the model's samples, from which noise on observed ones is worse than none of them."""
+STRAY = 0.1
+"""Of the model's diagonal: observed points farther off its samples are no part of the object."""
 REACH = 1.6
 """Radius of the ball, in spacings: gaps up to twice as wide are closed."""
 FINE = 3.5
@@ -51,6 +55,8 @@ class Samples:
     points: Float[np.ndarray, "N 3"]
     normals: Float[np.ndarray, "N 3"]
     """Unit."""
+    noise: float = 0.0
+    """m, how far points lie off the plane through their neighbours, as a rule."""
 
     def thinned(self, count: int) -> Samples:
         """At most so many, evenly from their order."""
@@ -71,16 +77,25 @@ def seen_samples(points: Float[np.ndarray, "N 3"], camera: Float[np.ndarray, " 3
     count = min(NEIGHBOURS, len(thin))
     around = thin[_nearest(KDTree(thin), thin, count)[1]]
     around = around - around.mean(1, keepdims=True)
-    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][..., 0]
+    spread, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    normal, noise = vectors[..., 0], float(np.median(np.maximum(spread[:, 0], 0)) / count) ** 0.5
     away = ((camera - thin) * normal).sum(-1, keepdims=True) < 0
-    return Samples(points=thin, normals=np.where(away, -normal, normal))
+    return Samples(points=thin, normals=np.where(away, -normal, normal), noise=noise)
 
 
 def joined(model: Samples, seen: Samples) -> Samples:
-    """A model's samples, replaced by observed ones where there are some that face the same way."""
+    """A model's samples, replaced by observed ones where there are some that face the same way.
+
+    Of a sensor that is too noisy for the model's spacing none are taken, nor what is far from it.
+    """
     if not len(seen.points) or not len(model.points):
         return seen if len(seen.points) else model
     spacing = _spacing(model.points)
+    diagonal = float(np.linalg.norm(np.ptp(model.points, axis=0)))
+    near = _nearest(KDTree(model.points), seen.points, 1)[0][:, 0] < STRAY * diagonal
+    if seen.noise > NOISY * spacing or not near.any():
+        return model
+    seen = Samples(points=seen.points[near], normals=seen.normals[near])
     gap, index = _nearest(KDTree(seen.points), model.points, 1)
     alike = (seen.normals[index[:, 0]] * model.normals).sum(-1) > 0.5
     kept = ~((gap[:, 0] < spacing) & alike)

@@ -226,6 +226,13 @@ def normalise(points: Float[Tensor, "*B N 3"]) -> tuple[Float[Tensor, "*B N 3"],
     # Equal points a metre away have a radius of rounding error, not of 0.
     rounding = 8 * torch.finfo(points.dtype).eps * centre.norm(dim=-1)
     if not bool((torch.isfinite(radius) & (radius > rounding)).all()):
+        odd = ~torch.isfinite(points)
+        if bool(odd.any()):
+            what = "NaN" if bool(torch.isnan(points).any()) else "infinite"
+            raise ValueError(
+                f"cloud: expected finite points, found {int(odd.any(-1).sum())} of "
+                f"{odd[..., 0].numel()} with {what} coordinates"
+            )
         raise ValueError(
             "cloud: expected finite points that differ, found mean radius "
             f"{radius.flatten().tolist()[:8]} about {centre.reshape(-1, 3).tolist()[:8]}"

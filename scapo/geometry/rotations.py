@@ -33,6 +33,13 @@ def unitquat_to_rotmat(quaternion: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 3
     return roma.unitquat_to_rotmat(quaternion)
 
 
+def rotmat_to_unitquat(rotation: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 4"]:
+    """Its inverse."""
+    import roma
+
+    return roma.rotmat_to_unitquat(rotation)
+
+
 def special_procrustes(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
     """The rotation nearest to a matrix."""
     import roma

@@ -14,8 +14,8 @@ What OP-Align's released evaluator asks of a network (`record_*`, docs/bring-you
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -27,18 +27,20 @@ from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
 from scapo.paper import losses
 from scapo.paper.augment import random_pose
-from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig
+from scapo.paper.autoencoder import Decoder, Encoder
+from scapo.paper.config import PRESETS, ScapoConfig
 from scapo.paper.figures import articulated_pictures, canonical_pictures
+from scapo.paper.first_targets import Inputs, first_targets, fit_networks
 from scapo.paper.heads import (
-    HeadConfig,
-    JointConfig,
     JointNetwork,
     KeypointNetwork,
     ResidualNetwork,
     Template,
     part_centroids,
+    thin,
 )
-from scapo.paper.objectives import Explanation, LossConfig, articulation, canonicalisation
+from scapo.paper.objectives import Explanation, articulation, canonicalisation
+from scapo.paper.part_search import PartSearch, motionless
 from scapo.paper.refine import refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
@@ -67,57 +69,6 @@ UNNAMED = frozenset({"preset", "supervision", "loss.without", "lr", "min_lr", "w
 """Options with names of their own in a variant, or that make no other."""
 CANONICALISE = "canonicalise"
 ARTICULATE = "articulate"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScapoConfig:
-    """Everything that can be chosen; the defaults are the paper's values (Sec. 4)."""
-
-    preset: Literal["paper", "cpu"] = "paper"
-    """Where the other defaults come from."""
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    decoder: DecoderConfig = field(default_factory=DecoderConfig)
-    joint: JointConfig = field(default_factory=JointConfig)
-    heads: HeadConfig = field(default_factory=HeadConfig)
-    loss: LossConfig = field(default_factory=LossConfig)
-    gamma: float = 0.01
-    """Start of the skinning temperature, for a mean radius of 0.25."""
-    template_start: Literal["medoid", "random"] = "medoid"
-    """Y_base and K: the decoded medoid of the training codes, or random numbers."""
-    encoder_in_stage_2: Literal["joint", "frozen"] = "joint"
-    """joint: frozen for the first half, then a tenth of the rate."""
-    supervision: tuple[Literal["segmentation", "joint"], ...] = ()
-    """Labels that training may see: both in Table 2."""
-    epochs: tuple[int, ...] = (200, 200)
-    """Of each stage; one number for both."""
-    lr: tuple[float, float] = (1e-3, 1e-4)
-    min_lr: float = 1e-6
-    weight_decay: float = 1e-8
-    batch: int = 16
-
-
-def cpu_config() -> ScapoConfig:
-    """The lean preset: under 1.5 M parameters, a few edges at a few centres, one-sided terms."""
-    return ScapoConfig(
-        preset="cpu",
-        encoder=EncoderConfig(
-            neighbours=12, centres=64, width=16, branch=(32, 96, 64, 32), features=48
-        ),
-        decoder=DecoderConfig(patches=4, points=512, widths=(128, 64, 64)),
-        joint=JointConfig(width=48, blocks=3, head=(128, 64), points=256),
-        heads=HeadConfig(keypoint=(256, 128, 128), residual=(64, 64)),
-        loss=LossConfig(
-            recon_form="partial",
-            disturbances=("noise", "crop", "resample"),
-            disturbances_per_step=1,
-            state_gauge=10.0,
-            part_mass=10.0,
-            boundary_temperature=0.05,
-        ),
-        epochs=(16, 16),
-        lr=(2e-3, 1e-3),
-        batch=32,
-    )
 
 
 class Scapo(AbstractMethod):
@@ -155,7 +106,7 @@ class Scapo(AbstractMethod):
     def variant(self) -> str:
         """The preset, S and J for the labels used, other options, and the ablated terms."""
         config = self.config
-        preset = ScapoConfig() if config.preset == "paper" else cpu_config()
+        preset = PRESETS[config.preset]()
         words = [] if config.preset == "paper" else [config.preset]
         words += ["".join(sorted((label[0].upper() for label in config.supervision), reverse=True))]
         words += changes(config, preset, leave=UNNAMED)
@@ -168,9 +119,10 @@ class Scapo(AbstractMethod):
         epochs = config.epochs * 2 if len(config.epochs) == 1 else config.epochs
         rates = [(1.0, 0.0)] * 5
         modules = ["joint_network", "keypoint_network", "residual_network", "template", "bones"]
-        if config.encoder_in_stage_2 == "joint":
+        late = {"joint": (0.1, 0.5), "end-to-end": (1.0, 0.0)}.get(config.encoder_in_stage_2)
+        if late is not None:
             modules += ["encoder", "decoder"]
-            rates += [(0.1, 0.5)] * 2
+            rates += [late] * 2
         groups = tuple(
             ParameterGroup(module=module, rate=rate, begin=begin)
             for module, (rate, begin) in zip(modules, rates, strict=True)
@@ -195,26 +147,65 @@ class Scapo(AbstractMethod):
     def start(
         self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
     ) -> None:
-        """Before stage 2: put the decoded medoid of (at most 2,000) codes into the template."""
+        """Before stage 2: the decoded medoid of (at most 2,000) codes into the template, and parts.
+
+        With `part_start` search, template, bones, joints and the networks' first answers are then
+        those of the search.
+        """
         del labels
-        if stage != ARTICULATE or self.config.template_start == "random":
+        config = self.config
+        if stage != ARTICULATE or config.template_start == "random":
             return
         number = observation.points.shape[0]
         chosen = torch.randperm(number, generator=generator, device=generator.device)[:2000]
         self.eval()
-        codes = [
-            self.encoder(normalise(observation.points[some])[0]).code for some in chosen.split(64)
-        ]
-        code = torch.cat(codes)
+        clouds = normalise(observation.points[chosen])[0]
+        seen = [self.encoder(thin(some, config.points or number)) for some in clouds.split(64)]
+        code = torch.cat([encoding.code for encoding in seen])
         medoid = torch.cdist(code, code).sum(1).argmin()
         shape, _ = self.decoder(code[medoid, None])
         keypoints = part_centroids(shape[0], len(self.category.parts))
         self.template.set_to(shape[0], keypoints)
         self.keypoint_network.start_at(keypoints)
+        if config.part_start == "search":
+            aligned = [
+                encoding.align(some) for encoding, some in zip(seen, clouds.split(64), strict=True)
+            ]
+            self._start_parts(torch.cat(aligned), code, int(medoid), generator)
+
+    def _start_parts(
+        self,
+        aligned: Float[Tensor, "B N 3"],
+        code: Float[Tensor, "B Z"],
+        medoid: int,
+        generator: torch.Generator,
+    ) -> None:
+        """Template, bones and networks as the search of parts leaves them."""
+        config = self.config.search
+        parts = PartSearch(self.kinds, config)
+        found, _ = parts.search(aligned[medoid], aligned)
+        skeleton = found.laid_over(self.template.points)
+        some = aligned[: config.taught]
+        at, _ = parts.place(some, found, motionless(some, len(self.kinds)), config.placing)
+        self.template.set_to(skeleton.points, skeleton.keypoints)
+        self.bones.set_to(skeleton.precision())
+        features = [self.decoder(codes)[1] for codes in code[: config.taught].split(64)]
+        fit_networks(
+            (self.joint_network, self.keypoint_network, self.residual_network),
+            Inputs(
+                template=skeleton.points,
+                aligned=some,
+                code=code[: config.taught],
+                features=torch.cat(features),
+            ),
+            first_targets(skeleton, at, self.kinds),
+            generator,
+            config.teaching,
+        )
 
     def explain(self, points: Float[Tensor, "B N 3"]) -> Explanation:
         """Run every network on clouds in the input frame."""
-        encoding = self.encoder(points)
+        encoding = self.encoder(thin(points, self.config.points or points.shape[1]))
         _, features = self.decoder(encoding.code)
         aligned = encoding.align(points)
         residual = self.residual_network(features)
@@ -222,6 +213,9 @@ class Scapo(AbstractMethod):
         keypoints = self.keypoint_network(encoding.code)
         template_keypoints = self.template.keypoints.expand_as(keypoints)
         joints, template_joints = self.joint_network.pair(aligned, template)
+        turn = None
+        if self.config.bones_turn:
+            turn = part_maps(cross_maps(template_joints, joints, self.kinds))[..., :3, :3]
         return Explanation(
             encoding=encoding,
             aligned=aligned,
@@ -231,7 +225,8 @@ class Scapo(AbstractMethod):
             template_keypoints=template_keypoints,
             joints=joints,
             template_joints=template_joints,
-            weights=self.bones.weights(aligned, keypoints),
+            weights=self.bones.weights(aligned, keypoints, turn),
+            bone_turn=turn,
             template_weights=self.bones.weights(template, template_keypoints),
         )
 
@@ -239,6 +234,7 @@ class Scapo(AbstractMethod):
         """The terms of the stage for a batch in random poses, times their weights."""
         points, similarity = normalise(observation.points)
         config = self.config.loss
+        labels, points = self._drawn(labels, points, step.generator)
         pose = random_pose(points.shape[0], config.shift, step.generator, points)
         points = apply(pose, points)
         if step.stage == CANONICALISE:
@@ -248,9 +244,21 @@ class Scapo(AbstractMethod):
         terms = articulation(explanation, self.bones, self.kinds, config)
         return terms | self._labelled(explanation, labels, similarity, pose)
 
+    def _drawn(
+        self, labels: Labels, points: Float[Tensor, "B N 3"], generator: torch.Generator
+    ) -> tuple[Labels, Float[Tensor, "B K 3"]]:
+        """The points of each cloud, and their part labels, that this step uses."""
+        count, number = self.config.points, points.shape[1]
+        if count is None or count >= number:
+            return labels, points
+        some = torch.randperm(number, generator=generator, device=points.device)[:count]
+        part = None if labels.part is None else labels.part[:, some]
+        return replace(labels, part=part), points[:, some]
+
     def _freeze(self, step: Step) -> None:
         """Stage 1's networks as they stand, batch statistics included, until they join."""
-        frozen = self.config.encoder_in_stage_2 == "frozen" or step.progress < 0.5
+        choice = self.config.encoder_in_stage_2
+        frozen = choice == "frozen" or (choice == "joint" and step.progress < 0.5)
         for network in (self.encoder, self.decoder):
             network.train(not frozen)
 

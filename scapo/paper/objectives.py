@@ -75,6 +75,8 @@ class LossConfig:
     variance_scale: float = 60.0
     proximity_scale: float = 30.0
     proximity_neighbours: int = 1
+    proximity_detach: bool = True
+    """The points of L_joint-prox are constants."""
     support: float = 20.0
     """tau of L_kp-seg, in points."""
     support_mean: losses.KeypointMean = "parts"
@@ -170,6 +172,8 @@ class Explanation:
     """Template frame."""
     weights: Float[Tensor, "B N P"]
     template_weights: Float[Tensor, "B M P"]
+    bone_turn: Float[Tensor, "B P 3 3"] | None = None
+    """How the cloud's bones are turned against the template's; None where they are not."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,6 +201,7 @@ def deform_all(e: Explanation, bones: Bones, kinds: tuple[JointKind, ...]) -> De
     own = part_maps(incident_maps(e.joints, kinds))
     canonical = to_canonical(own, e.aligned, e.weights)
     keypoints = apply(invert(own), e.keypoints[:, :, None])[:, :, 0]
+    turn = None if e.bone_turn is None else own[..., :3, :3].mT @ e.bone_turn
     template_own = part_maps(incident_maps(e.template_joints, kinds))
     template_canonical = to_canonical(template_own, e.template, e.template_weights)
     to_template = cross_maps(e.joints, e.template_joints, kinds)
@@ -204,7 +209,7 @@ def deform_all(e: Explanation, bones: Bones, kinds: tuple[JointKind, ...]) -> De
     return Deformations(
         canonical=canonical,
         canonical_keypoints=keypoints,
-        canonical_weights=bones.weights(canonical, keypoints),
+        canonical_weights=bones.weights(canonical, keypoints, turn),
         returned=deform(own, canonical, e.weights),
         template_returned=deform(template_own, template_canonical, e.template_weights),
         x2y=deform(part_maps(to_template), e.aligned, e.weights),
@@ -269,7 +274,11 @@ def joint_terms(
     terms: dict[str, Callable[[], Tensor]] = {
         "joint_prox": lambda: sum_of(
             losses.joint_proximity(
-                pivot, points, config.proximity_scale, config.proximity_neighbours
+                pivot,
+                points,
+                config.proximity_scale,
+                config.proximity_neighbours,
+                detach=config.proximity_detach,
             )
             for pivot, points in ((x.pivot, d.canonical), (y.pivot, e.template))
         ),

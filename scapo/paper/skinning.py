@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, joint_motion, mean_rotation, rigid, rotation_between
-from scapo.geometry.rotations import unitquat_to_rotmat
+from scapo.geometry.rotations import rotmat_to_unitquat, unitquat_to_rotmat
 from scapo.paper.heads import JointPairs
 
 
@@ -36,20 +36,54 @@ class Bones(nn.Module):
         return orientation.mT @ (self.log_scale.exp()[..., None] * orientation)
 
     def weights(
-        self, points: Float[Tensor, "B N 3"], centres: Float[Tensor, "B P 3"]
+        self,
+        points: Float[Tensor, "B N 3"],
+        centres: Float[Tensor, "B P 3"],
+        turn: Float[Tensor, "B P 3 3"] | None = None,
     ) -> Float[Tensor, "B N P"]:
         """w_i = softmax_p(-W_i / gamma), W the Mahalanobis distances (paper's W, not its weights).
 
-        Expanded as s^T Q s - 2 s^T Q o + o^T Q o, which holds no (B, N, P, 3) tensor.
+        Args:
+            points: Of a shape.
+            centres: O, its keypoints.
+            turn: How its parts are turned against the template; bones turn along (BANMo). None:
+                every shape has the same V, whatever its state.
         """
-        precision = self.precision()
-        points = points - centres.mean(1, keepdim=True)
-        centres = centres - centres.mean(1, keepdim=True)
-        pairs = (points[..., :, None] * points[..., None, :]).flatten(-2)  # (B, N, 9)
-        square = pairs @ precision.flatten(1).mT  # (B, N, P)
-        pulled = torch.einsum("pij,bpj->bpi", precision, centres)
-        distance = square - 2 * points @ pulled.mT + (pulled * centres).sum(-1)[:, None]
-        return torch.softmax(-distance / self.log_gamma.exp(), -1)
+        precision = self.precision() / self.log_gamma.exp()
+        if turn is not None:
+            precision = turn @ precision @ turn.mT
+        return gaussian_weights(points, centres, precision)
+
+    def set_to(self, precision: Float[Tensor, "P 3 3"]) -> None:
+        """Take orientation and scale from Q / gamma of each bone; gamma stays."""
+        with torch.no_grad():
+            values, vectors = torch.linalg.eigh(precision * self.log_gamma.exp())
+            sign = torch.linalg.det(vectors).sign()[:, None, None]
+            self.quaternion.copy_(rotmat_to_unitquat((vectors * sign).mT))
+            self.log_scale.copy_(values.clamp(min=1e-6).log())
+
+
+def gaussian_weights(
+    points: Float[Tensor, "B N 3"],
+    centres: Float[Tensor, "B P 3"],
+    precision: Float[Tensor, "*B P 3 3"],
+) -> Float[Tensor, "B N P"]:
+    """Softmax over parts of minus the Mahalanobis distances.
+
+    Expanded as s^T Q s - 2 s^T Q o + o^T Q o, which holds no (B, N, P, 3) tensor.
+
+    Args:
+        points: Of a shape.
+        centres: Of the bones.
+        precision: Q / gamma, of each shape or of all.
+    """
+    points = points - centres.mean(1, keepdim=True)
+    centres = centres - centres.mean(1, keepdim=True)
+    pairs = (points[..., :, None] * points[..., None, :]).flatten(-2)  # (B, N, 9)
+    square = pairs @ precision.flatten(-2).mT  # (B, N, P)
+    pulled = (precision @ centres[..., None])[..., 0]
+    distance = square - 2 * points @ pulled.mT + (pulled * centres).sum(-1)[:, None]
+    return torch.softmax(-distance, -1)
 
 
 def incident_maps(joints: JointPairs, kinds: tuple[JointKind, ...]) -> Float[Tensor, "B J 2 4 4"]:

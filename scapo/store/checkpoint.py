@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, Category
 from scapo.geometry.points import MEAN_RADIUS
+from scapo.store.definitions import DEFINITION, defined
 from scapo.store.files import CHECKPOINT, Arrays, Header, read, write
 from scapo.store.json_records import StoreError, from_json
 from scapo.types import Supervision
@@ -157,6 +158,8 @@ class CheckpointHeader:
     training: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     normalisation: dict[str, str | float] = field(default_factory=dict)
+    definition: dict[str, Any] | None = None
+    """Of a category that the package has not (`definitions`)."""
 
 
 RUN_FIELDS = ("seed", "data_digest", "supervision", "steps", "finished", "versions")
@@ -171,6 +174,10 @@ def read_checkpoint(path: Path) -> tuple[Arrays, Header]:
             values of other types than those of `CheckpointHeader`.
     """
     path = path / WEIGHTS if path.is_dir() else path
+    if not path.exists():
+        raise StoreError(
+            f"{path}: expected a file, found none; `scapo-bench train METHOD --out RUN` makes one"
+        )
     arrays, header = read(path, CHECKPOINT)
     check_header(header, f"{path}: header")
     return arrays, header
@@ -183,11 +190,23 @@ def check_header(header: object, where: str) -> CheckpointHeader:
         StoreError: As `read_checkpoint`.
     """
     known = from_json(CheckpointHeader, header, where)
-    if known.category not in CATEGORIES:
-        raise StoreError(
-            f"{where}: category: expected one of {', '.join(CATEGORIES)}, found {known.category!r}"
-        )
+    header_category(known, where)
     return known
+
+
+def header_category(known: CheckpointHeader, where: str) -> Category:
+    """The category that a checkpoint is of, as the header defines it or the package.
+
+    Raises:
+        StoreError: Neither does.
+    """
+    found = defined({DEFINITION: known.definition}, known.category, where)
+    if found is None:
+        raise StoreError(
+            f"{where}: category: expected one of {', '.join(CATEGORIES)} or a definition, found "
+            f"{known.category!r}"
+        )
+    return found
 
 
 def require_fields(header: Header, names: Iterable[str], where: object) -> None:

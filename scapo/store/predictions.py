@@ -19,7 +19,9 @@ import numpy as np
 from jaxtyping import Bool, Num
 from safetensors import SafetensorError, safe_open
 
+from scapo.categories import Category
 from scapo.geometry.matrices import rotation_error
+from scapo.store.definitions import defined, definition, foreign
 from scapo.store.files import PREDICTIONS, read_header, write
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
@@ -64,6 +66,8 @@ class Header:
     """Anything about cost: device, batch, seconds_per_cloud, training_seconds, parameters."""
     run: dict[str, Any] = field(default_factory=dict)
     """The training behind it: commit, config, machine, data digest of its split."""
+    definition: Category | None = None
+    """Of a category that the package has not."""
 
     def record(self) -> dict[str, Any]:
         """As stored in the file."""
@@ -79,6 +83,7 @@ class Header:
             "budget": self.budget,
             "run": self.run,
             **({} if self.camera is None else {"camera": self.camera}),
+            **({} if self.definition is None else definition(self.definition)),
         }
 
 
@@ -109,10 +114,12 @@ def read_prediction_header(path: Path) -> Header:
     seed = record.get("seed")
     if isinstance(seed, bool) or not isinstance(seed, int) or abs(seed) >= 2**63:
         raise StoreError(f"{path}: header field 'seed': expected an integer, found {_shown(seed)}")
+    category = _text(path, record, "category")
+    known = defined(record, category, f"{path}: header")
     return Header(
         method=_text(path, record, "method"),
         variant=_text(path, record, "variant", empty=True),
-        category=_text(path, record, "category"),
+        category=category,
         split=_text(path, record, "split"),
         seed=seed,
         data_digest=_text(path, {DIGEST_KEYS[0]: digests[0]}, DIGEST_KEYS[0]),
@@ -120,6 +127,7 @@ def read_prediction_header(path: Path) -> Header:
         camera=_camera(path, record),
         budget=_object(path, record, "budget"),
         run=_object(path, record, "run"),
+        definition=None if known is None else foreign(known),
     )
 
 

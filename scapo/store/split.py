@@ -151,7 +151,10 @@ def find_split(folder: Path | str, category: str | None, split: str) -> Path:
             return found[0]
     there = [path for depth in range(4) for path in folder.glob("*/" * depth + "manifest.json")]
     names = ", ".join(sorted(str(path.parent.relative_to(folder)) for path in there)[:20])
-    raise StoreError(f"{folder}: expected {wanted}/manifest.json, found {names or 'none'}")
+    command = f"scapo-data generate {category or 'CATEGORY'} --split {split} --out {folder}"
+    raise StoreError(
+        f"{folder}: expected {wanted}/manifest.json, found {names or 'none'}; `{command}` makes one"
+    )
 
 
 def _folders(path: Path) -> list[Path]:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from scapo.method import AbstractMethod
 from scapo.store import checkpoint, provenance
+from scapo.store.definitions import definition
 from scapo.store.files import (
     Arrays,
     Header,
@@ -84,6 +85,26 @@ class TrainingHeader:
     """As the checkpoint's."""
 
 
+def apart(one: object, other: object) -> tuple[object, object]:
+    """Two JSON values, of objects only the keys at which they differ.
+
+    >>> apart({"a": 1, "b": {"c": 2, "d": 3}}, {"a": 1, "b": {"c": 2, "d": 4}})
+    ({'b': {'d': 3}}, {'b': {'d': 4}})
+    """
+    if not (isinstance(one, dict) and isinstance(other, dict)):
+        return one, other
+    mine, its = cast("dict[str, object]", one), cast("dict[str, object]", other)
+    pairs: tuple[dict[str, object], dict[str, object]] = ({}, {})
+    for key in sorted({*mine, *its}):
+        if key in mine and key in its and mine[key] != its[key]:
+            pairs[0][key], pairs[1][key] = apart(mine[key], its[key])
+        elif key not in its:
+            pairs[0][key] = mine[key]
+        elif key not in mine:
+            pairs[1][key] = its[key]
+    return pairs
+
+
 class RunFolder:
     """Files of one run; only the first rank writes."""
 
@@ -95,6 +116,7 @@ class RunFolder:
         """What checkpoint and config.json say."""
         extra: dict[str, Any] = {
             **self.about,
+            **definition(self.method.category),
             "supervision": sorted(self.method.supervision),
             "parameters": sum(item.numel() for item in self.method.parameters()),
             "steps": position.step,
@@ -120,7 +142,9 @@ class RunFolder:
         """
         there = (self.path / checkpoint.TRAINING).is_file()
         if there and not resume:
-            raise StoreError(f"{self.path}: expected no run there, found one; resume continues it")
+            raise StoreError(
+                f"{self.path}: expected no run there, found one; --resume continues it"
+            )
         return there
 
     def load(self, state: State, rank: int = 0) -> tuple[bool, Arrays | None]:
@@ -187,12 +211,15 @@ class RunFolder:
 
     def _check_same(self, path: Path, found: Header) -> None:
         expected = json.loads(canonical_json(self.header(Position(), finished=False)))
-        for name in SAME:
-            if found.get(name) != expected[name]:
-                raise StoreError(
-                    f"{path}: {name}: expected {canonical_json(expected[name])} to resume, "
-                    f"found {canonical_json(found.get(name))}"
-                )
+        names = [name for name in SAME if found.get(name) != expected[name]]
+        if names:
+            asked, there = apart(expected[names[0]], found.get(names[0]))
+            more = f" (and another {', '.join(names[1:])})" if names[1:] else ""
+            raise StoreError(
+                f"{path}: {names[0]}: expected {canonical_json(asked)} to resume, found "
+                f"{canonical_json(there)}{more}; --resume takes the flags and data of before, "
+                "another --out begins anew"
+            )
 
     def save(
         self,

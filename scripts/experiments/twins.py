@@ -264,7 +264,7 @@ def drives(urdf: Path) -> bool:
     robot = builder.build()
     low, high = robot.get_qlimits().T
     for joint in robot.active_joints:
-        joint.set_drive_properties(stiffness=400, damping=40, mode="acceleration")
+        joint.set_drive_properties(stiffness=4000, damping=130, mode="acceleration")
     for end, start in ((high, low), (low, high)):
         for share in [*np.linspace(0, 1, 180), *[1.0] * 120]:
             for k, joint in enumerate(robot.active_joints):

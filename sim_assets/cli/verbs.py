@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, Category
+from scapo.text import did_you_mean
 from sim_assets.cli.console import progress_bar, say, say_each, show_made, watched
 from sim_assets.options import DataOptions
 
@@ -24,6 +25,31 @@ if TYPE_CHECKING:
     CategoryName = str
 else:
     CategoryName = Literal[tuple(CATEGORIES)]
+NameOfAny = Annotated[str, tyro.conf.arg(metavar="{" + ",".join([*CATEGORIES, "..."]) + "}")]
+"""One of the package's categories or of a file's."""
+
+
+class UsageError(ValueError):
+    """A word of the command line that the parser could not know to be wrong."""
+
+
+def find(name: str, file: Path | None) -> Category:
+    """The category of this name, of the package or of a file of categories.
+
+    Raises:
+        UsageError: There is none.
+        StoreError: The file is not what it should be.
+    """
+    from scapo.store.definitions import read_categories
+
+    known = CATEGORIES if file is None else {**read_categories(file), **CATEGORIES}
+    if name not in known:
+        hint = "" if file else ", or one of your own with --categories FILE"
+        raise UsageError(
+            f"category {name!r}: expected one of {', '.join(known)}{hint}"
+            f"{did_you_mean(name, known)}"
+        )
+    return known[name]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,8 +100,10 @@ class Check:
     """Folder of models, searched recursively, or one .urdf file."""
     json: Path | None = None
     """File that the results are written to as well."""
-    category: CategoryName | None = None
+    category: NameOfAny | None = None
     """Category that the models must be of; default: some joint can be used."""
+    categories: Path | None = None
+    """Categories of your own, a TOML file (docs/categories.md)."""
     up: str | None = None
     """Axis of the URDF's root link that is up, such as z or -y."""
     front: str | None = None
@@ -99,7 +127,7 @@ class Check:
             say(console, f"{result.path}  {why}", label=f"{result.status:8} ", style=style)
 
         options = Options(
-            category=self.category,
+            category=None if self.category is None else find(self.category, self.categories),
             up=self.up,
             front=self.front,
             scale=self.scale,
@@ -120,10 +148,13 @@ class Generate:
     Started again after an interruption it goes on; the bytes are the same either way.
     """
 
-    category: tyro.conf.Positional[CategoryName]
-    """Category of the objects."""
+    category: tyro.conf.Positional[NameOfAny]
+    """Category of the objects; one of your own with --categories."""
     out: Path
     """Folder of the data set."""
+    categories: Path | None = None
+    """Categories of your own, a TOML file (docs/categories.md); it takes --source with models. The
+    data carry the definition, so that no later command asks for the file."""
     data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
     workers: int | None = None
     """Worker processes; by default as many as pay, one per core at most, and one at least for
@@ -140,7 +171,7 @@ class Generate:
         """Make them, print a summary, and name the objects that failed."""
         from sim_assets.generation.generate import Running, make_split
 
-        started = time.monotonic()
+        started, kind = time.monotonic(), find(self.category, self.categories)
         with progress_bar(console) as show:
             running = Running(
                 workers=self.workers,
@@ -149,7 +180,7 @@ class Generate:
                 strict=self.strict,
                 progress=show,
             )
-            made = make_split(self.category, self.data, self.out, running)
+            made = make_split(kind, self.data, self.out, running)
         show_made(console, made, time.monotonic() - started)
         return 1 if made.failed else 0
 
@@ -305,12 +336,15 @@ class View:
     """Address to listen at; 0.0.0.0 lets other machines in."""
     source: Path | None = None
     """Folder of the models that the data set was made from, to show their meshes."""
+    predictions: Path | None = None
+    """Predictions of one of its splits, to show beside the truth: axes in orange, points by
+    predicted part."""
 
     def run(self, console: Console) -> int:
         """Serve until interrupted."""
         from sim_assets.inspect.view import Viewer
 
-        viewer = Viewer(self.path, self.source, self.host, self.port)
+        viewer = Viewer(self.path, self.source, self.host, self.port, self.predictions)
         try:
             say(console, f"{viewer.url} (Ctrl-C ends it)")
             threading.Event().wait()
@@ -331,7 +365,7 @@ class Preview:
     """File of the picture, FILE.png."""
     count: int = 24
     """Number of samples of each split, spread evenly."""
-    category: CategoryName | None = None
+    category: str | None = None
     """Category to draw; default: all."""
     split: str | None = None
     """Split to draw; default: all."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from scapo.geometry.camera import Intrinsics
 from scapo.store import Split, write_bytes
+from scapo.store.definitions import DEFINITION
 from scapo.store.manifest import Manifest
 from scapo.text import as_markdown
 from sim_assets.describe.croissant import CROISSANT, croissant_text
@@ -134,6 +135,7 @@ def remake(manifest: Manifest) -> str | None:
     words = [f"--{name.replace('_', '-')} {value}" for name, value in flags.items()]
     switches = ("color", "ambiguity", "any_model")
     words += [f"--{name.replace('_', '-')}" for name in switches if options.get(name)]
+    words += ["--categories FILE"] if DEFINITION in options else []
     return f"scapo-data generate {manifest.category} --out OUT {' '.join(words)}"
 
 

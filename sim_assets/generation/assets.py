@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from scapo.categories import Category
+from scapo.store.definitions import category_of
 from scapo.store.manifest import Instance, Manifest
 from sim_assets import procedural
 from sim_assets.models.account import check_speaks
@@ -64,7 +66,7 @@ class UrdfAsset:
     urdf: Path
     root: Path
     """The source folder."""
-    category: str
+    category: str | Category
     up: str | None = None
     """Which axis of the URDF's root link is up; None: as the source says."""
     front: str | None = None
@@ -114,7 +116,7 @@ def procedural_assets(category: str, split: str, seed: int, count: int) -> list[
     ]
 
 
-def folder_assets(category: str, options: DataOptions) -> list[Asset]:
+def folder_assets(category: str | Category, options: DataOptions) -> list[Asset]:
     """The models of the folder `options.source` that belong to the split, read as options say.
 
     Raises:
@@ -190,7 +192,7 @@ def _asset(manifest: Manifest, instance: Instance, source: Path | None) -> Asset
         return UrdfAsset(
             urdf=urdf,
             root=root,
-            category=manifest.category,
+            category=category_of(manifest),
             up=options.get("up"),
             front=options.get("front"),
             scale=options.get("scale"),

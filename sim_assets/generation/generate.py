@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from scapo.categories import category as find_category
+from scapo.categories import Category
 from scapo.parallel.pool import AbstractPool, Outcome
 from scapo.parallel.ray import Engine, open_pool
 from scapo.store.manifest import Manifest, Shard, shards_digest
@@ -88,7 +88,7 @@ def open_workers(running: Running, *requests: Request) -> AbstractPool[Any, Any]
 
 
 def make_split(
-    category: str, options: DataOptions, out: Path, running: Running | None = None
+    category: str | Category, options: DataOptions, out: Path, running: Running | None = None
 ) -> Made:
     """Make OUT/CATEGORY/SPLIT, or finish one that was begun: `scapo-data generate`.
 
@@ -101,7 +101,7 @@ def make_split(
         options = replace(options, source=str(Path(options.source).absolute()))
     request, assets = make_request(category, options)
     found = versions(request.settings.backend)
-    return generate(request, assets, out / category / options.split, found, running)
+    return generate(request, assets, out / request.category / options.split, found, running)
 
 
 def generate(
@@ -295,7 +295,7 @@ def _manifest(
     done: Sequence[ShardDone],
     refused: int,
 ) -> Manifest:
-    category = find_category(request.category)
+    category = request.kind
     shards, first = [], 0
     for shard in done:
         if shard.count:

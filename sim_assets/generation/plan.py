@@ -13,7 +13,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from scapo.categories import Category
 from scapo.store import canonical_json
+from scapo.store.definitions import definition
 from scapo.store.manifest import Instance
 from sim_assets.generation.assets import Asset
 from sim_assets.models.account import sentences
@@ -29,7 +31,7 @@ SHARD_SAMPLES = 64
 class Request:
     """What is asked for, apart from where to put it."""
 
-    category: str
+    kind: Category
     split: str
     seed: int
     count: int
@@ -41,6 +43,11 @@ class Request:
     source_options: dict[str, Any]
     """How models are read: all that changes the objects."""
     settings: Settings
+
+    @property
+    def category(self) -> str:
+        """Its name."""
+        return self.kind.name
 
     def options(self) -> dict[str, Any]:
         """All that changes pixels, for the manifest."""
@@ -58,6 +65,7 @@ class Request:
             "source": self.source,
             "instances": self.instances,
             **self.source_options,
+            **definition(self.kind),
         }
 
     def key(self, view: int) -> tuple[object, ...]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from importlib import metadata
 from math import ceil
 
+from scapo.categories import Category
 from scapo.categories import category as find_category
 from sim_assets.generation.assets import Asset, folder_assets, procedural_assets
 from sim_assets.generation.plan import Request
@@ -22,7 +23,7 @@ MIN_IMAGE, MAX_IMAGE = 32, 4096
 
 
 def make_request(
-    category: str, options: DataOptions, models: Sequence[Asset] | None = None
+    category: str | Category, options: DataOptions, models: Sequence[Asset] | None = None
 ) -> tuple[Request, list[Asset]]:
     """The request and the objects to choose from.
 
@@ -35,26 +36,26 @@ def make_request(
         ValueError: An option is out of range, the category is unknown, or has no such objects.
         RenderError: The backend does not work here.
     """
-    find_category(category)
+    kind = category if isinstance(category, Category) else find_category(category)
     _check(options)
     procedural = options.source == "procedural"
     if procedural:
         instances = options.instances or ceil(options.count / SAMPLES_PER_INSTANCE)
-        assets = procedural_assets(category, options.split, options.seed, instances)
+        assets = procedural_assets(kind.name, options.split, options.seed, instances)
     else:
-        assets = _models(category, options) if models is None else list(models)
+        assets = _models(kind, options) if models is None else list(models)
         instances = options.instances or min(len(assets), options.count)
     given = {name: getattr(options, name) for name in ("up", "front", "scale")}
     given["any_model"] = options.any_model or None
     request = Request(
-        category=category,
+        kind=kind,
         split=options.split,
         seed=options.seed,
         count=options.count,
         instances=instances,
         source="procedural" if procedural else "urdf",
         source_options={name: value for name, value in given.items() if value is not None},
-        settings=_settings(options),
+        settings=make_settings(options),
     )
     return request, assets
 
@@ -76,7 +77,13 @@ def versions(backend: Backend | None) -> dict[str, str]:
     return {**{name: metadata.version(name) for name in names}, **drawn}
 
 
-def _settings(options: DataOptions) -> Settings:
+def make_settings(options: DataOptions) -> Settings:
+    """What decides a view's pixels, besides its object.
+
+    Raises:
+        ValueError: Options that contradict each other.
+        RenderError: The backend does not work here.
+    """
     preset = find_preset(options.preset)
     protocol = options.protocol or preset.protocol
     if preset.paired and protocol != "full":
@@ -108,7 +115,7 @@ def _settings(options: DataOptions) -> Settings:
     )
 
 
-def _models(category: str, options: DataOptions) -> list[Asset]:
+def _models(category: Category, options: DataOptions) -> list[Asset]:
     if options.split == "test-ood":
         raise ValueError("split test-ood: expected procedural objects, found --source with a path")
     found = folder_assets(category, options)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from scapo.categories import Category
 from scapo.store.schema import UNLABELLED
 from scapo.types import Joints, Labels, Observation, Sample, SampleKey
 from sim_assets.generation.assets import Asset
@@ -20,7 +21,7 @@ from sim_assets.rendering.backends import make_renderer
 from sim_assets.sampling.samples import Row, SampleMaker
 
 
-def stream(category: str, **options: Any) -> Iterator[Sample]:  # noqa: ANN401
+def stream(category: str | Category, **options: Any) -> Iterator[Sample]:  # noqa: ANN401
     """See `sim_assets.generate_samples`."""
     request, assets = make_request(category, DataOptions(**options))
     return _samples(request, assets[: request.instances])

@@ -15,11 +15,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from scapo.categories import JointKind, JointSpec
+from scapo.categories import Category, JointKind, JointSpec
 from scapo.parallel.pool import Outcome, Pool, Report
 from scapo.store.files import write_bytes
 from scapo.text import one_line
-from sim_assets.generation.request import make_request
+from sim_assets.generation.request import make_settings
 from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.joints import Candidate, candidates
 from sim_assets.models.library import find, source_root
@@ -40,7 +40,7 @@ Status = Literal["accepted", "repaired", "refused"]
 class Options:
     """How to read the models; None: as the source says."""
 
-    category: str | None = None
+    category: str | Category | None = None
     """Check as objects of this category; else that some joint can be used at all."""
     up: str | None = None
     front: str | None = None
@@ -200,10 +200,10 @@ def show(urdf: Path, thing: ArticulatedObject) -> None:
     Raises:
         AssetError: No view shows enough of every part.
     """
-    request, _ = make_request(thing.category.name, DataOptions(count=1, backend="raycast"))
+    settings = make_settings(DataOptions(count=1, backend="raycast"))
     with make_renderer("raycast") as renderer:
         try:
-            list(SampleMaker(renderer, thing, request.settings).render_views([("check",)]))
+            list(SampleMaker(renderer, thing, settings).render_views([("check",)]))
         except ViewError as error:
             reason = str(error).removeprefix(f"{thing.instance}: expected ")
             raise AssetError(urdf, f"expected {reason}") from error

@@ -29,10 +29,13 @@ from scapo.store.schema import UNLABELLED
 from scapo.text import one_line
 from sim_assets.describe.info import describe_state, find_splits
 from sim_assets.generation.assets import RecoverError, recover
+from sim_assets.inspect.answers import Answers, read_answers
 from sim_assets.inspect.server import start_server
 from sim_assets.objects import ArticulatedObject
 
 PAINTS = ("part", "colour")
+ANSWERED = "predicted part"
+"""A third way to paint the points, of a split with predictions."""
 FRAMES = ("object", "camera")
 OPACITY = 0.4
 SHOWN = (
@@ -50,6 +53,8 @@ SHOWN = (
 LONGEST_TEXT = 300
 """Characters of a line from a file."""
 AXIS = (17, 17, 17)
+PREDICTED = (214, 90, 0)
+"""Of a predicted axis, beside the true one."""
 FRUSTUM = (120, 120, 120)
 CAMERA, OBJECT = "/camera", "/camera/object"
 FROM_FRONT, FROM_CAMERA = np.array([-1.0, -0.75, 0.6]), np.array([0.0, 0.0, -1.0])
@@ -63,7 +68,12 @@ class Viewer:
     """
 
     def __init__(
-        self, path: Path, source: Path | None = None, host: str = "localhost", port: int = 8080
+        self,
+        path: Path,
+        source: Path | None = None,
+        host: str = "localhost",
+        port: int = 8080,
+        predictions: Path | None = None,
     ) -> None:
         """Start serving.
 
@@ -72,9 +82,10 @@ class Viewer:
             source: Folder of the models, for a data set made from some.
             host: Address to listen at.
             port: Port to listen at; the next free one is taken if it is in use.
+            predictions: A file of predictions of one of the splits, to show beside the truth.
 
         Raises:
-            StoreError: There is no data set, or it is broken.
+            StoreError: There is no data set, or it is broken; predictions of none of its splits.
             ValueError: `port` is out of range, or `host` is no address of this machine.
             RuntimeError: viser is not installed.
         """
@@ -82,6 +93,7 @@ class Viewer:
             raise ValueError(f"port: expected 1 to 65535, found {port}")
         splits = [Split(folder) for folder in find_splits(path)]
         self.splits = {_name(path, split): split for split in splits}
+        self.answered = None if predictions is None else read_answers(predictions, self.splits)
         self.source = source
         self.lock = threading.RLock()
         self.thing: ArticulatedObject | None = None
@@ -107,12 +119,17 @@ class Viewer:
         """What is there for every split; `_open` adds the sample slider, `_load` the joints'."""
         gui = self.server.gui
         names = tuple(self.splits)
-        self.split_box = gui.add_dropdown("Data", names, initial_value=names[0], order=0)
+        first = names[0] if self.answered is None else self.answered[0]
+        paints = PAINTS if self.answered is None else (*PAINTS, ANSWERED)
+        self.split_box = gui.add_dropdown("Data", names, initial_value=first, order=0)
         self.sample_box: Any = None
-        self.paint_box = gui.add_dropdown("Points by", PAINTS, initial_value=PAINTS[0])
+        self.paint_box = gui.add_dropdown("Points by", paints, initial_value=PAINTS[0])
         self.frame_box = gui.add_dropdown("Frame", FRAMES, initial_value=FRAMES[0])
         self.cloud_box = gui.add_checkbox("Cloud", initial_value=True)
         self.axes_box = gui.add_checkbox("Joint axes", initial_value=True)
+        self.answer_box = gui.add_checkbox(
+            "Predicted axes", initial_value=True, visible=self.answered is not None
+        )
         self.camera_box = gui.add_checkbox("Camera", initial_value=False)
         self.mesh_box = gui.add_checkbox("Object", initial_value=True)
         self.opacity_box = gui.add_slider("Opacity", 0.1, 1.0, 0.05, OPACITY)
@@ -123,7 +140,8 @@ class Viewer:
         self.split_box.on_update(lambda _: self._open())
         self.paint_box.on_update(lambda _: self._draw())
         self.frame_box.on_update(lambda _: self._draw(turned=True))
-        for box in (self.cloud_box, self.axes_box, self.camera_box, self.mesh_box):
+        boxes = (self.cloud_box, self.axes_box, self.answer_box, self.camera_box, self.mesh_box)
+        for box in boxes:
             box.on_update(lambda _: self._hide())
         self.opacity_box.on_update(lambda _: self._fade())
 
@@ -134,7 +152,7 @@ class Viewer:
             manifest = self.split.manifest
             colored = bool(manifest.options.get("color"))
             self.samples = self.split.arrays(*SHOWN, *(["color"] if colored else []))
-            self.paint_box.disabled = not colored
+            self.paint_box.disabled = not colored and self._answers() is None
             if self.sample_box is not None:
                 self.sample_box.remove()
             last = max(manifest.count - 1, 1)
@@ -144,6 +162,11 @@ class Viewer:
             self.instance = -1
             self.show(0)
             self._draw(turned=True)
+
+    def _answers(self) -> Answers | None:
+        """Predictions of the split that is shown."""
+        shown = self.answered is not None and self.answered[0] == self.split_box.value
+        return self.answered[1] if self.answered is not None and shown else None
 
     def show(self, number: int) -> None:
         """Show a sample of the split."""
@@ -194,7 +217,9 @@ class Viewer:
             self._pose()
 
     def _displayed(self) -> DisplayedSample:
-        row, part = self.row, self.row["part"]
+        row, part, said = self.row, self.row["part"], self._answers()
+        if self.paint_box.value == ANSWERED and said is not None:
+            part = said.part[self.number]
         digits = "".join(color[1:] for color in (*PART_COLORS, BACKGROUND))
         colors = np.frombuffer(bytes.fromhex(digits), np.uint8).reshape(-1, 3)
         paint = colors[np.where(part == UNLABELLED, len(PART_COLORS), part % len(PART_COLORS))]
@@ -207,6 +232,7 @@ class Viewer:
             pivot=row["joint_pivot"].astype(float),
             axis=row["joint_axis"].astype(float),
             camera=row["camera"].astype(float),
+            predicted=None if said is None else (said.pivot[self.number], said.axis[self.number]),
         )
 
     def _pose(self) -> None:
@@ -222,6 +248,7 @@ class Viewer:
             for box, handles in (
                 (self.cloud_box, self.scene.cloud),
                 (self.axes_box, self.scene.axes),
+                (self.answer_box, self.scene.answers),
                 (self.camera_box, self.scene.camera),
                 (self.mesh_box, self.scene.parts),
             ):
@@ -247,6 +274,7 @@ class Viewer:
             f"Sample {self.number} of {manifest.count}: {manifest.instances[self.instance].id}",
             f"State: {states}",
             f"Surface seen: {seen}",
+            *([] if (said := self._answers()) is None else [f"Predicted by {said.title}: orange"]),
             *([f"No mesh: {self.missing}"] if self.missing else []),
         ]
         return _html(lines)
@@ -291,6 +319,8 @@ class DisplayedSample:
     pivot: Float[np.ndarray, "J 3"]
     axis: Float[np.ndarray, "J 3"]
     camera: Float[np.ndarray, " 6"]
+    predicted: tuple[Float[np.ndarray, "J 3"], Float[np.ndarray, "J 3"]] | None = None
+    """Pivots and unit axes that a method says."""
 
     @property
     def placed(self) -> bool:
@@ -312,6 +342,8 @@ class SampleScene:
     """Of a viser server."""
     cloud: list[Any] = field(default_factory=list)
     axes: list[Any] = field(default_factory=list)
+    answers: list[Any] = field(default_factory=list)
+    """Predicted axes."""
     camera: list[Any] = field(default_factory=list)
     parts: list[Any] = field(default_factory=list)
     """A frame per part of the object, above its meshes."""
@@ -335,14 +367,11 @@ class SampleScene:
             point_shading="flat",
         )
         self.cloud = [points]
-        for handle in self.axes:
+        for handle in (*self.axes, *self.answers):
             handle.remove()
-        pairs = zip(sample.pivot, sample.axis, strict=True)
-        self.axes = [
-            self._arrow(f"{CAMERA}/axis{j}", pivot, axis, reach)
-            for j, (pivot, axis) in enumerate(pairs)
-            if np.isfinite([pivot, axis]).all()
-        ]
+        self.axes = self._arrows("axis", (sample.pivot, sample.axis), reach, AXIS)
+        said = sample.predicted
+        self.answers = [] if said is None else self._arrows("predicted", said, reach, PREDICTED)
         self.camera = [self._frustum(sample.camera, reach)] if sample.camera[1] > 0 else []
 
     def load(self, thing: ArticulatedObject | None, opacity: float) -> None:
@@ -377,22 +406,26 @@ class SampleScene:
             handle = self.scene.add_frame(name, show_axes=False)
         _place(handle, pose)
 
-    def _arrow(
+    def _arrows(
         self,
         name: str,
-        pivot: Float[np.ndarray, " 3"],
-        axis: Float[np.ndarray, " 3"],
+        lines: tuple[Float[np.ndarray, "J 3"], Float[np.ndarray, "J 3"]],
         reach: float,
-    ) -> Any:  # noqa: ANN401
-        ends = np.stack([pivot - 0.4 * reach * axis, pivot + 0.6 * reach * axis])
-        return self.scene.add_arrows(
-            name,
-            ends[None],
-            AXIS,
-            shaft_radius=0.005 * reach,
-            head_radius=0.016 * reach,
-            head_length=0.05 * reach,
-        )
+        color: tuple[int, int, int],
+    ) -> list[Any]:
+        """An arrow for each pivot and axis that are known."""
+        return [
+            self.scene.add_arrows(
+                f"{CAMERA}/{name}{j}",
+                np.stack([pivot - 0.4 * reach * axis, pivot + 0.6 * reach * axis])[None],
+                color,
+                shaft_radius=0.005 * reach,
+                head_radius=0.016 * reach,
+                head_length=0.05 * reach,
+            )
+            for j, (pivot, axis) in enumerate(zip(*lines, strict=True))
+            if np.isfinite([pivot, axis]).all()
+        ]
 
     def _frustum(self, camera: Float[np.ndarray, " 6"], reach: float) -> Any:  # noqa: ANN401
         _, fy, _, _, width, height = camera.tolist()

@@ -85,7 +85,7 @@ class _Resting:
 
 def read(
     urdf: Path,
-    category: str,
+    category: str | Category,
     *,
     up: str | None = None,
     front: str | None = None,
@@ -96,7 +96,7 @@ def read(
 
     Args:
         urdf: The file.
-        category: Name of one of `scapo.categories.CATEGORIES`.
+        category: One of `scapo.categories.CATEGORIES`, or another.
         up: Which axis of the URDF's root link is up, such as "z" or "-y"; by the source if None.
         front: Which axis the front faces; by the source, else told from the joint, if None.
         scale: Metres per unit of the URDF; by the source if None.
@@ -110,7 +110,7 @@ def read(
         AssetError: The model cannot be used; the message says why.
         ValueError: No such category.
     """
-    spec = find_category(category)
+    spec = category if isinstance(category, Category) else find_category(category)
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise refuse(urdf, "a scale above zero", f"{scale}")
     files = SourceFiles(urdf=urdf, root=root or package_root(urdf), repairs=Repairs())

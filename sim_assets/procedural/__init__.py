@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from scapo.text import did_you_mean
 from sim_assets.objects import ArticulatedObject
 from sim_assets.procedural import (
     basket,
@@ -55,7 +56,10 @@ def recipe(category: str) -> Recipe:
         ValueError: There is none; the message lists those that are.
     """
     if category not in RECIPES:
-        raise ValueError(f"category {category!r}: expected one of {', '.join(RECIPES)}")
+        raise ValueError(
+            f"category {category!r}: expected one of {', '.join(RECIPES)}, which have a generator, "
+            f"or models of it (generate --source FOLDER){did_you_mean(category, RECIPES)}"
+        )
     return RECIPES[category]
 
 

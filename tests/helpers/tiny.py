@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from scapo.categories import CATEGORIES
 from scapo.paper.autoencoder import DecoderConfig, EncoderConfig
+from scapo.paper.config import ScapoConfig, cpu_config
 from scapo.paper.heads import HeadConfig, JointConfig
-from scapo.paper.method import Scapo, ScapoConfig, cpu_config
+from scapo.paper.method import Scapo
 from scapo.store.samples import TrainingData
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator

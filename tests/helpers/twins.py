@@ -81,3 +81,31 @@ def cabinet(state: float = 0.6, name: str = "safe", **changes) -> Made:
     )
     boxes = tuple(trimesh.creation.box(size).apply_translation(at) for size, at in (BODY, DOOR))
     return Made(replace(twin, **changes), pose, boxes, pivot, axis)
+
+
+def glasses() -> Twin:
+    """A bar with two temples that meet where both are folded; seen from the front, at state 0."""
+    boxes = [
+        box_samples((0.02, 0.2, 0.04), (-0.1, 0.0, 0.0), 0.04),
+        box_samples((0.18, 0.02, 0.02), (0.0, 0.1, 0.0), 0.04),
+        box_samples((0.18, 0.02, 0.02), (0.0, -0.1, 0.0), 0.04),
+    ]
+    part = np.repeat([0, 1, 2], [len(one.points) for one in boxes])
+    points = np.concatenate([one.points for one in boxes])
+    normals = np.concatenate([one.normals for one in boxes])
+    camera_T_object = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0.6], [0, 0, 0, 1]])
+    turn = camera_T_object[:3, :3]
+    hinges = np.array([[-0.09, 0.1, 0.0], [-0.09, -0.1, 0.0]])
+    seen = trimesh.transform_points(points, camera_T_object)
+    return Twin(
+        name="glasses",
+        category=category("eyeglasses"),
+        points=seen,
+        part=part,
+        camera_T_part=np.stack([camera_T_object] * 3),
+        pivot=trimesh.transform_points(hinges, camera_T_object),
+        axis=np.array([[0.0, 0, -1], [0, 0, 1]]) @ turn.T,
+        state=np.zeros(2),
+        limits=np.array([[0.0, 1.4], [0.0, 1.4]]),
+        shape=Shape(points=seen, normals=normals @ turn.T, part=part),
+    )

@@ -24,7 +24,8 @@ from tests.helpers.tiny import TINY, tiny
 from tests.scapo.training.test_run_folder import REPLACED, altered, places, refusal
 
 CODE = """
-from scapo.paper.method import Scapo, ScapoConfig, cpu_config
+from scapo.paper.config import ScapoConfig, cpu_config
+from scapo.paper.method import Scapo
 from scapo.registry import Method
 
 class Renamed(Scapo):

@@ -28,7 +28,8 @@ from torch.profiler import ProfilerActivity, profile
 from scapo.categories import CATEGORIES
 from scapo.geometry.points import normalise
 from scapo.method import Step
-from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
+from scapo.paper.config import ScapoConfig, cpu_config
+from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
 from scapo.types import Labels, Observation
 
 POINTS = 1024

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from bench.__main__ import main
 from bench.tables.actuation import load_actuations, table_7
 from bench.tables.render import to_csv, to_latex, to_markdown
 from bench.tables.write import make_tables
@@ -58,8 +59,37 @@ def test_a_joint_that_was_tried_twice_or_on_other_data_is_refused(tmp_path):
         load_actuations(tmp_path, "test")
 
 
-def test_it_is_written_with_the_others_and_says_where_there_is_nothing(tmp_path):
-    (tmp_path / "scores").mkdir()
-    written = make_tables(tmp_path / "scores", tmp_path / "out")
-    assert tmp_path / "out" / "table7.md" in written
-    assert "No actuations were found." in (tmp_path / "out" / "table7.md").read_text()
+def test_it_is_written_with_the_others_from_actuations_alone(tmp_path):
+    write_actuations(tmp_path / "scores" / "a.csv", ROWS)
+    made = make_tables(tmp_path / "scores")
+    assert [table.number for table in made.with_ours()] == ["7"]
+    assert tmp_path / "out" / "table7.md" in made.write(tmp_path / "out")
+    assert "75.0" in (tmp_path / "out" / "table7.md").read_text()
+    assert "No actuations were found." in to_markdown(table_7({}))
+
+
+def test_only_ours_leaves_the_printed_rows_out(tmp_path):
+    write_actuations(tmp_path / "a.csv", ROWS)
+    made = make_tables(tmp_path, only_ours=True)
+    rows = [row for table in made.tables for block in table.blocks for row in block.rows]
+    assert rows
+    assert {row.source for row in rows} == {"ours"}
+
+
+def test_a_folder_without_scores_is_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["tables", "--scores", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    assert "expected scores on test (NAME.csv.gz), found none; `scapo-bench evaluate` writes" in (
+        capsys.readouterr().err.replace("\n", " ")
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_prints_what_has_rows_of_ours(tmp_path, capsys):
+    write_actuations(tmp_path / "a.csv", ROWS)
+    main(["tables", "--scores", str(tmp_path), "--out", str(tmp_path / "out"), "--only-ours"])
+    text = capsys.readouterr().out
+    assert "Table 7." in text
+    assert "Table 1." not in text
+    assert "75.0" in text

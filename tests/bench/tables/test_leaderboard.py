@@ -32,7 +32,7 @@ def folder(tmp_path_factory) -> Path:
     ladder = top / "ladders" / name / "ladder.md"
     ladder.parent.mkdir(parents=True)
     ladder.write_text("a ladder")
-    write.make_tables(top / "scores", top / "tables", page=True)
+    write.make_tables(top / "scores").write(top / "tables", page=True)
     return top
 
 

@@ -19,7 +19,7 @@ NAMES = ["=HYPERLINK(1)", "+1", "-1+2", "@x", "<img src=x onerror=alert(1)>", "a
 def test_a_name_is_text_in_every_form(name, tmp_path):
     make_scores(tmp_path / "in", name.replace("/", "_"), "laptop", variant="v")
     make_scores(tmp_path / "in", "scapo", "laptop")
-    paths = make_tables(tmp_path / "in", tmp_path / "out")
+    paths = make_tables(tmp_path / "in").write(tmp_path / "out")
     texts = {path.name: path.read_text() for path in paths}
     for file, text in texts.items():
         if file.endswith(".csv"):

@@ -209,7 +209,7 @@ def test_ablations_by_the_end_of_the_variant(built):
 
 def test_significance(scores, tmp_path):
     folder, kept = scores
-    tables.make_tables(folder, tmp_path)
+    tables.make_tables(folder).write(tmp_path)
     text = (tmp_path / "significance.csv").read_text()
     rows = list(csv.DictReader(text.splitlines()))
     row = next(r for r in rows if (r["first"], r["second"], r["metric"]) ==
@@ -232,7 +232,7 @@ def test_latex_compiles_and_golden(scores, tmp_path, repository, update_golden):
     if program_ is None:
         pytest.skip("no pdflatex on this machine")
     folder, _ = scores
-    tables.make_tables(folder, tmp_path)
+    tables.make_tables(folder).write(tmp_path)
     for number in NUMBERS:
         command = [program_, "-interaction=nonstopmode", "-halt-on-error", f"table{number}.tex"]
         done = subprocess.run(

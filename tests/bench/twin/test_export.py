@@ -15,7 +15,7 @@ import trimesh
 import yourdfpy
 
 from bench.twin.export import write_twin
-from tests.helpers.twins import STEP, Made, cabinet
+from tests.helpers.twins import STEP, Made, cabinet, glasses
 
 STATE = 0.6
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -35,7 +35,8 @@ def test_the_files_are_there_and_equal_twins_give_equal_bytes(
     made: Made, files: list[Path], tmp_path: Path
 ):
     names = ["mobility.urdf", "meshes/body-0.obj", "meshes/body-collision-0.obj"]
-    names += ["meshes/door-0.obj", "meshes/door-collision-0.obj", "twin.glb", "twin.json"]
+    names += ["meshes/door-0.obj", "meshes/door-collision-0.obj", "mobility.srdf"]
+    names += ["twin.glb", "twin.json"]
     assert [path.relative_to(files[0].parent).as_posix() for path in files] == names
     again = write_twin(made.twin, tmp_path / "again")
     assert [path.read_bytes() for path in again] == [path.read_bytes() for path in files]
@@ -81,33 +82,36 @@ def test_what_is_in_the_way_is_not_overwritten(made: Made, tmp_path: Path):
 
 @pytest.mark.skipif(find_spec("sapien") is None, reason="SAPIEN (extra [sim]) is not installed")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_it_opens_and_closes_in_sapien(files: list[Path]):
+@pytest.mark.parametrize("kind", ["safe", "eyeglasses"])
+def test_it_opens_and_closes_in_sapien(kind: str, files: list[Path], tmp_path: Path):
     """Driven from one end of its range to the other and back, hulls and all."""
+    urdf = files[0] if kind == "safe" else write_twin(glasses(), tmp_path / "glasses")[0]
+    robot, scene = simulated(urdf)
+    low, high = robot.get_qlimits().T
+    assert len(low) == (1 if kind == "safe" else 2)
+    assert min(link.mass for link in robot.links) > 0
+    for joint in robot.active_joints:
+        joint.set_drive_properties(stiffness=4000, damping=130, mode="acceleration")
+    for start, end in ((low, high), (high, low)):
+        for share in [*np.linspace(0, 1, 240), *[1.0] * 120]:
+            for k, joint in enumerate(robot.active_joints):
+                joint.set_drive_target(float(start[k] + share * (end[k] - start[k])))
+            scene.step()
+            assert np.isfinite(robot.qpos).all()
+            assert np.abs(robot.qvel).max() < 5.0
+            assert (low - 0.05 < robot.qpos).all()
+            assert (robot.qpos < high + 0.05).all()
+        np.testing.assert_allclose(robot.qpos, end, atol=0.05)
+
+
+def simulated(urdf: Path) -> tuple[Any, Any]:
+    """The robot and its scene."""
     sapien: Any = import_module("sapien")
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
     scene.set_timestep(1 / 240)
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
-    builder = loader.load_file_as_articulation_builder(str(files[0]))
+    builder = loader.load_file_as_articulation_builder(str(urdf))
     for link in builder.link_builders:
         link.visual_records.clear()  # they need a renderer
-    robot = builder.build()
-    (joint,) = robot.active_joints
-    joint.set_drive_properties(stiffness=400, damping=40, mode="acceleration")
-    reached, fastest = [], 0.0
-    for target in [
-        *np.linspace(0, 1.5, 240),
-        *[1.5] * 120,
-        *np.linspace(1.5, 0, 240),
-        *[0.0] * 120,
-    ]:
-        joint.set_drive_target(float(target))
-        scene.step()
-        reached.append(float(robot.qpos[0]))
-        fastest = max(fastest, abs(float(robot.qvel[0])))
-    assert np.isfinite(reached).all()
-    assert max(reached) == pytest.approx(1.5, abs=0.05)
-    assert reached[-1] == pytest.approx(0.0, abs=0.05)
-    assert min(reached) > -0.05
-    assert fastest < 5.0
-    assert [round(link.mass, 3) for link in robot.links][1] > 0
+    return builder.build(), scene

@@ -9,7 +9,14 @@ import trimesh
 from scipy.spatial import KDTree
 
 from bench.twin.surface import MAX_FACES, Samples, closed_mesh, joined, seen_samples
-from tests.helpers.twins import STEP, box_samples
+from tests.helpers import twins
+
+STEP = 0.05
+"""Between samples, m."""
+
+
+def box_samples(size: tuple[float, float, float]) -> Samples:
+    return twins.box_samples(size, step=STEP)
 
 
 def check_closed(mesh: trimesh.Trimesh) -> None:
@@ -99,7 +106,7 @@ def test_nothing_has_no_surface():
 
 
 def test_normals_of_seen_points_look_at_the_camera():
-    samples = box_samples((0.4, 0.5, 0.6), step=0.05)
+    samples = box_samples((0.4, 0.5, 0.6))
     camera = np.array([-2.0, 0.5, 1.0])
     seen = ((camera - samples.points) * samples.normals).sum(-1) > 0
     # Away from the edges, where neighbours lie on one face.
@@ -123,3 +130,9 @@ def test_observed_points_take_the_place_of_the_models():
     none = Samples(points=np.zeros((0, 3)), normals=np.zeros((0, 3)))
     assert joined(model, none) is model
     assert joined(none, seen) is seen
+    stray = Samples(points=seen.points + np.array([0, 0, 0.5]), normals=seen.normals)
+    assert joined(model, stray) is model
+    rough = np.random.default_rng(0).normal(0, 0.03, seen.points.shape)
+    noisy = seen_samples(seen.points + rough, np.array([0.0, 0.0, 5.0]))
+    assert noisy.noise == pytest.approx(0.03, rel=0.3)
+    assert joined(model, noisy) is model

@@ -13,7 +13,8 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Step
 from scapo.paper.autoencoder import EncoderConfig
-from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo, ScapoConfig, cpu_config
+from scapo.paper.config import ScapoConfig
+from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator, is_rotation, rigid_motions
@@ -47,23 +48,6 @@ def trained(steps: int = 8, category: str = "laptop") -> Scapo:
 
 def predict(model: Scapo, points: torch.Tensor) -> Prediction:
     return model.predict(Observation(points=points))
-
-
-def test_the_cpu_preset_has_at_most_a_million_and_a_half_parameters() -> None:
-    made = Scapo(cpu_config(), CATEGORIES["eyeglasses"], generator(0))
-    assert sum(parameter.numel() for parameter in made.parameters()) <= 1_500_000
-
-
-def test_defaults_are_the_papers() -> None:
-    config = ScapoConfig()
-    assert config.decoder.points == 1024
-    assert (config.lr, config.min_lr, config.weight_decay) == ((1e-3, 1e-4), 1e-6, 1e-8)
-    assert config.epochs == (200, 200)
-    weights = config.loss
-    assert (weights.cycle, weights.recon, weights.kp_seg, weights.seg) == (10, 10, 1, 1)
-    assert (weights.shape_var, weights.dir_align, weights.joint_prox) == (10, 0.1, 1)
-    assert (weights.joint_boundary, weights.variance_scale, weights.proximity_scale) == (3, 60, 30)
-    assert (weights.state_gauge, weights.part_mass) == (0, 0)
 
 
 def test_stages_freeze_the_encoder_for_half_of_the_second() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from scapo.paper.method import ScapoConfig
+from scapo.paper.config import ScapoConfig
 from scapo.store import checkpoint
 from scapo.store.schema import StoreError
 from tests.helpers.tiny import TINY, tiny

@@ -163,18 +163,20 @@ def test_what_is_there_is_said_where_nothing_fits(tmp_path: Path) -> None:
         ("", "", r"\*/"),
         ("..", "train", r"\.\./train"),
     ):
-        with pytest.raises(StoreError, match=rf"expected {wanted}/manifest.json, found {there}$"):
+        with pytest.raises(StoreError, match=rf"expected {wanted}/manifest.json, found {there};"):
             find_split(tmp_path, category, split)
 
 
 def test_a_split_in_a_folder_of_another_name_is_not_taken_for_it(tmp_path: Path) -> None:
     write_split(tmp_path / "test", split="train")
-    with pytest.raises(StoreError, match=r"expected \*/test/manifest.json, found test$"):
+    with pytest.raises(StoreError, match=r"expected \*/test/manifest.json, found test;"):
         find_split(tmp_path, None, "test")
+    with pytest.raises(StoreError, match=r"`scapo-data generate safe --split val --out .*` makes"):
+        find_split(tmp_path, "safe", "val")
 
 
 def test_an_empty_a_missing_and_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"expected laptop/train/manifest.json, found none$"):
+    with pytest.raises(StoreError, match=r"expected laptop/train/manifest.json, found none;"):
         find_split(tmp_path, "laptop", "train")
     with pytest.raises(StoreError, match=r"gone: expected a folder of samples, found none$"):
         find_split(tmp_path / "gone", "laptop", "train")

@@ -136,7 +136,7 @@ def test_the_command_as_torchrun_starts_it(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "report.html").is_file()
     again = torchrun(*words)
     assert again.returncode != 0
-    assert "expected no run there, found one; resume continues it" in again.stderr
+    assert "expected no run there, found one; --resume continues it" in again.stderr
 
 
 def test_one_process_is_one_rank(monkeypatch: pytest.MonkeyPatch) -> None:

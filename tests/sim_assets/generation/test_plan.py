@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from scapo.categories import CATEGORIES
 from scapo.geometry.camera import Intrinsics
 from sim_assets.generation.assets import ProceduralAsset
 from sim_assets.generation.plan import (
@@ -34,7 +35,7 @@ def request(count: int, states: int = 1, **changes) -> Request:
         states_per_view=states,
     )
     fields = {
-        "category": "laptop",
+        "kind": CATEGORIES["laptop"],
         "split": "train",
         "seed": 1,
         "count": count,
@@ -107,7 +108,7 @@ def test_keys_tell_views_splits_seeds_and_sources_apart():
         request(1, split="val").key(0),
         request(1, seed=2).key(0),
         request(1, source="urdf").key(0),
-        request(1, category="oven").key(0),
+        request(1, kind=CATEGORIES["oven"]).key(0),
     }
     assert len(keys) == 6
     assert request(1).key(0) == request(500).key(0)

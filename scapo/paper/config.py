@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""What can be chosen of SCAPO, and the presets: the paper's values, its letter, and lean ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from scapo.paper.autoencoder import DecoderConfig, EncoderConfig
+from scapo.paper.heads import HeadConfig, JointConfig
+from scapo.paper.objectives import LossConfig
+from scapo.paper.part_search import SearchConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScapoConfig:
+    """Everything that can be chosen; the defaults are the paper's values (Sec. 4)."""
+
+    preset: Literal["paper", "literal", "cpu", "complete"] = "paper"
+    """Where the other defaults come from."""
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    heads: HeadConfig = field(default_factory=HeadConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    gamma: float = 0.01
+    """Start of the skinning temperature, for a mean radius of 0.25."""
+    template_start: Literal["medoid", "random"] = "medoid"
+    """Y_base and K: the decoded medoid of the training codes, or random numbers."""
+    part_start: Literal["means", "search"] = "means"
+    """Bones, joints and networks of stage 2 begin at the P-means of the template, or at what a
+    search of parts explains the clouds best by (not in the paper)."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """Used with `part_start` search only."""
+    bones_turn: bool = False
+    """V of a bone turns with its part (BANMo); otherwise it is the same in every state."""
+    encoder_in_stage_2: Literal["joint", "frozen", "end-to-end"] = "joint"
+    """joint: frozen for the first half, then a tenth of the rate; end-to-end: all of it."""
+    supervision: tuple[Literal["segmentation", "joint"], ...] = ()
+    """Labels that training may see: both in Table 2."""
+    epochs: tuple[int, ...] = (200, 200)
+    """Of each stage; one number for both."""
+    lr: tuple[float, float] = (1e-3, 1e-4)
+    min_lr: float = 1e-6
+    weight_decay: float = 1e-8
+    batch: int = 16
+    points: int | None = None
+    """Points of a cloud that the encoder sees and a step of training uses; None = all."""
+
+
+def cpu_config() -> ScapoConfig:
+    """The lean preset: under 1.5 M parameters, a few edges at a few centres, one-sided terms."""
+    return ScapoConfig(
+        preset="cpu",
+        encoder=EncoderConfig(
+            neighbours=12, centres=64, width=16, branch=(32, 96, 64, 32), features=48
+        ),
+        decoder=DecoderConfig(patches=4, points=512, widths=(128, 64, 64)),
+        joint=JointConfig(width=48, blocks=3, head=(128, 64), points=256),
+        heads=HeadConfig(keypoint=(256, 128, 128), residual=(64, 64)),
+        loss=LossConfig(
+            recon_form="partial",
+            disturbances=("noise", "crop", "resample"),
+            disturbances_per_step=1,
+            state_gauge=10.0,
+            part_mass=10.0,
+            boundary_temperature=0.05,
+        ),
+        epochs=(16, 16),
+        lr=(2e-3, 1e-3),
+        batch=32,
+    )
+
+
+def literal_config() -> ScapoConfig:
+    """What is printed and nothing else, where print says anything (docs/method.md).
+
+    No second Chamfer distance, all of stage 2 end to end at one rate, both states of a joint free,
+    the squared norm of the whole residual, gradients through entropies and points, no agreement
+    term for two joints, and a template that starts at random.
+    """
+    return ScapoConfig(
+        preset="literal",
+        joint=JointConfig(base_fixed=False),
+        loss=LossConfig(
+            rec_aligned=0.0,
+            base_gap=0.0,
+            variance_form="whole",
+            proximity_detach=False,
+            boundary_detach=False,
+        ),
+        template_start="random",
+        encoder_in_stage_2="end-to-end",
+    )
+
+
+def complete_config() -> ScapoConfig:
+    """Lean, for whole surfaces: parts are searched for, and reconstruction outweighs priors."""
+    lean = cpu_config()
+    return replace(
+        lean,
+        preset="complete",
+        points=512,
+        encoder=replace(lean.encoder, centres=48, neighbours=10, branch=(32, 64, 48, 32)),
+        decoder=replace(lean.decoder, points=256),
+        joint=replace(lean.joint, width=32, points=192, base_fixed=False, revolute_range=4.0),
+        loss=replace(
+            lean.loss,
+            recon_form="squared",
+            recon=300.0,
+            shape_var=1.0,
+            seg=0.1,
+            joint_boundary=0.1,
+            state_gauge=1.0,
+        ),
+        part_start="search",
+        bones_turn=True,
+        epochs=(5, 5),
+    )
+
+
+PRESETS: dict[str, Callable[[], ScapoConfig]] = {
+    "paper": ScapoConfig,
+    "literal": literal_config,
+    "cpu": cpu_config,
+    "complete": complete_config,
+}

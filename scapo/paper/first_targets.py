@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: MIT
+"""Stage 2's networks begin at what the search of parts found: regression before their losses.
+
+Not in the paper. For some training clouds the search tells how the template lies in them; here that
+becomes what Theta_J, Theta_K and Theta_Delta should say of them, in the aligned frame of stage 1,
+and the networks are fitted to it. No label is involved.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from scapo.categories import JointKind
+from scapo.geometry.rigid import apply, joint_motion, rotation_between
+from scapo.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from scapo.paper.heads import JointNetwork, JointPairs, KeypointNetwork, ResidualNetwork
+from scapo.paper.part_search import Placements, Skeleton
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstTargets:
+    """What the networks should say of each cloud."""
+
+    joints: JointPairs
+    """Aligned frame."""
+    template_joints: JointPairs
+    residual: Float[Tensor, "B M 3"]
+    keypoints: Float[Tensor, "B P 3"]
+    """Aligned frame."""
+
+    def rows(self, index: Tensor) -> FirstTargets:
+        """Those of some clouds."""
+        return FirstTargets(
+            joints=_rows(self.joints, index),
+            template_joints=_rows(self.template_joints, index),
+            residual=self.residual[index],
+            keypoints=self.keypoints[index],
+        )
+
+
+def _rows(joints: JointPairs, index: Tensor) -> JointPairs:
+    return JointPairs(pivot=joints.pivot[index], axis=joints.axis[index], state=joints.state[index])
+
+
+def first_targets(s: Skeleton, at: Placements, kinds: tuple[JointKind, ...]) -> FirstTargets:
+    """Targets from where the skeleton lies in each cloud.
+
+    The base's turn about the joint's axis is its state; the rest of its pose is in axis and pivot.
+    """
+    turn = rotvec_to_rotmat(at.turn)  # aligned_R_template (B, 3, 3)
+    size = at.size.exp()[:, None]
+    axis_y = F.normalize(s.axis, dim=-1).expand(len(turn), -1, -1)
+    pivot_y = s.pivot * size
+    axis_x = axis_y @ turn.mT
+    twist = turn.mT[:, None] @ rotation_between(axis_x, axis_y).mT  # about axis_y (B, J, 3, 3)
+    angle = (rotmat_to_rotvec(twist) * axis_y).sum(-1)
+    hinge = torch.tensor([kind == "revolute" for kind in kinds])
+    angle = torch.where(hinge, angle, 0.0)
+    keypoints = [s.keypoints[:1] * size]
+    for j, kind in enumerate(kinds):
+        motion = joint_motion(pivot_y[:, j], axis_y[:, j], at.state[:, j], kind)
+        keypoints.append(apply(motion, s.keypoints[j + 1] * size))
+    place = torch.cat(keypoints, 1) @ turn.mT + at.shift[:, None]
+    return FirstTargets(
+        joints=JointPairs(
+            pivot=pivot_y @ turn.mT + at.shift[:, None],
+            axis=axis_x,
+            state=torch.stack([-angle, at.state - angle], -1),
+        ),
+        template_joints=JointPairs(
+            pivot=pivot_y,
+            axis=axis_y,
+            state=torch.zeros_like(at.state)[..., None].expand(-1, -1, 2),
+        ),
+        residual=s.points * (size - 1),
+        keypoints=place,
+    )
+
+
+def joint_error(said: JointPairs, wanted: JointPairs) -> Float[Tensor, ""]:
+    """Squared errors of pivots, axes and states."""
+    return (
+        3 * (said.pivot - wanted.pivot).square().sum(-1).mean()
+        + (said.axis - wanted.axis).square().sum(-1).mean()
+        + (said.state - wanted.state).square().sum(-1).mean()
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inputs:
+    """What the networks see of the clouds, constant while the encoder is."""
+
+    template: Float[Tensor, "M 3"]
+    """Y_base."""
+    aligned: Float[Tensor, "B N 3"]
+    code: Float[Tensor, "B Z"]
+    features: Float[Tensor, "B M C"]
+
+
+RATE = 2e-3
+"""Learning rate at the beginning."""
+
+
+@torch.enable_grad()
+def fit_networks(
+    networks: tuple[JointNetwork, KeypointNetwork, ResidualNetwork],
+    inputs: Inputs,
+    wanted: FirstTargets,
+    generator: torch.Generator,
+    steps: int,
+) -> list[float]:
+    """Fit the three networks to the targets; the mean loss of every 50 steps.
+
+    Args:
+        networks: Theta_J, Theta_K, Theta_Delta.
+        inputs: Of the clouds.
+        wanted: Of the same clouds.
+        generator: Chooses batches and points.
+        steps: Of Adam, 32 clouds each, the rate on half a cosine from RATE.
+    """
+    joints, keypoints, residual = networks
+    parameters = trainable(networks)
+    optimizer = torch.optim.Adam(parameters, lr=RATE)
+    count, number = inputs.aligned.shape[:2]
+    history: list[float] = []
+    for k in range(steps):
+        index = torch.randint(count, (32,), generator=generator, device=generator.device)
+        order = torch.randperm(number, generator=generator, device=generator.device)
+        want = wanted.rows(index)
+        change = residual(inputs.features[index])
+        own, its = joints.pair(inputs.aligned[index][:, order], inputs.template + change.detach())
+        loss = (
+            joint_error(own, want.joints)
+            + joint_error(its, want.template_joints)
+            + 10 * (change - want.residual).square().sum(-1).mean()
+            + (keypoints(inputs.code[index]) - want.keypoints).square().sum(-1).mean()
+        )
+        for group in optimizer.param_groups:
+            group["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * k / steps))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        history.append(float(loss.detach()))
+    return [sum(history[k : k + 50]) / 50 for k in range(0, steps - 49, 50)]
+
+
+def trainable(networks: Sequence[nn.Module]) -> list[nn.Parameter]:
+    """Their parameters, which can be learned from here on."""
+    for network in networks:
+        network.train().requires_grad_(True)
+    return [parameter for network in networks for parameter in network.parameters()]
