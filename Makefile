@@ -11,7 +11,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 export LP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup vulkan demo demo-train test test-quick coverage fuzz lint format bench lock dist clean
+.PHONY: help setup vulkan demo demo-train test test-quick coverage fuzz lint format bench docs lock dist clean
 
 help: ## these lines
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -55,6 +55,10 @@ format: setup ## ruff, writing
 bench: setup ## speed tests
 	@$(BIN)/python -m pytest tests/speed --benchmark-enable --benchmark-columns=min,median,rounds \
 	  --jaxtyping-packages= -p no:xdist $(ARGS)
+
+docs: setup ## the pages of docs/ as a site in build/site
+	@$(BIN)/python -m pip install -q --no-build-isolation -e '.[docs]'
+	@$(BIN)/mkdocs build --strict $(ARGS)
 
 lock: setup ## resolve pyproject.toml anew into the lock files (ARGS=--upgrade)
 	@scripts/lock.sh $(ARGS)
