@@ -20,6 +20,9 @@ from scapo.geometry.points import farthest_points, k_means
 from scapo.paper.vector_neurons import uniform
 
 
+MOST_BLOCKS = 100  # Of any network: five are published
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointPairs:
     """Joints of one shape with a state on either side, the paper's (c, d, a) with a in R^2."""
@@ -50,6 +53,11 @@ class JointConfig:
     """The same for prismatic joints, in normalised units."""
     base_fixed: bool = True
     """Hold the parent's state at 0: moving the base is the same as moving the object."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for more blocks than any network has: a damaged file may ask for them."""
+        if not 1 <= self.blocks <= MOST_BLOCKS:
+            raise ValueError(f"blocks: expected 1 to {MOST_BLOCKS}, found {self.blocks}")
 
 
 def thin(points: Float[Tensor, "B N 3"], count: int) -> Float[Tensor, "B K 3"]:
