@@ -19,7 +19,6 @@ from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import farthest_points, k_means
 from scapo.paper.vector_neurons import uniform
 
-
 MOST_BLOCKS = 100  # Of any network: five are published
 
 
@@ -55,7 +54,7 @@ class JointConfig:
     """Hold the parent's state at 0: moving the base is the same as moving the object."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for more blocks than any network has: a damaged file may ask for them."""
+        """Raise ValueError for more blocks than any network has, as damaged files ask for."""
         if not 1 <= self.blocks <= MOST_BLOCKS:
             raise ValueError(f"blocks: expected 1 to {MOST_BLOCKS}, found {self.blocks}")
 

@@ -155,7 +155,7 @@ class PointNetConfig:
     """The same for prismatic joints, in normalised units: the published code has one number."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for more blocks than any network has: a damaged file may ask for them."""
+        """Raise ValueError for more blocks than any network has, as damaged files ask for."""
         if not 1 <= self.blocks <= MOST_BLOCKS:
             raise ValueError(f"blocks: expected 1 to {MOST_BLOCKS}, found {self.blocks}")
 
