@@ -16,7 +16,7 @@ from sim_assets.rendering.doctor import PACKAGES
 
 tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 
-EXTRAS = {"sim", "gpu-sim", "bench", "view", "export", "cluster", "kiss-matcher", "all"}
+EXTRAS = {"sim", "gpu-sim", "bench", "view", "export", "cluster", "kiss-matcher", "onnx", "all"}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_console_scripts_refuse_unknown_words(script: str):
 def test_all_is_the_union_of_the_extras(pyproject: dict[str, Any]):
     extras = pyproject["project"]["optional-dependencies"]
     assert set(extras) == EXTRAS
-    assert extras["all"] == ["scapo[sim,gpu-sim,bench,view,export,cluster,kiss-matcher]"]
+    assert extras["all"] == ["scapo[sim,gpu-sim,bench,view,export,cluster,kiss-matcher,onnx]"]
 
 
 def test_doctor_lists_what_the_extras_bring(pyproject: dict[str, Any]):
