@@ -21,7 +21,6 @@ from bench.requests import ReleaseRequest
 from bench.scoring.score_files import SUFFIX, Report, read_report
 from scapo.method import AbstractMethod, Mode, evenly
 from scapo.predictor import Predictor
-from scapo.records import map_tensors
 from scapo.store import Header, StoreError, open_split, sha256_file, write, write_bytes
 from scapo.store.checkpoint import RUN_FIELDS, WEIGHTS, require_fields, to_arrays
 from scapo.store.files import read
@@ -185,11 +184,11 @@ def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[st
     model = Predictor(load(checkpoint)[0], "cpu")
     for mode in MODES:
         with torch.no_grad():
-            said = map_tensors(model.predict(points, mode), lambda one: one.detach().float())
+            said = model.predict(points, mode)
         if said.part_weight is None or said.camera_T_part is None:
             raise StoreError(f"{checkpoint}: expected parts and poses in mode {mode}, found none")
-        yield mode, {"part_weight": said.part_weight.numpy(),
-                     "camera_T_part": said.camera_T_part.numpy()}  # fmt: skip
+        yield mode, {"part_weight": said.part_weight.float().numpy(),
+                     "camera_T_part": said.camera_T_part.float().numpy()}  # fmt: skip
 
 
 def card_of(header: Header, request: ReleaseRequest) -> str:

@@ -232,11 +232,19 @@ def find_training(folder: Path, trained: Header, scored: Split) -> Split:
         return found
     parts = scored.folder.resolve().parent.parent.parent
     for path in sorted(parts.glob(f"*/{trained.category}/{trained.split}/manifest.json")):
-        other = Split(path.parent)
-        if other.manifest.digest == trained.data_digest:
+        other = _readable(path.parent)
+        if other is not None and other.manifest.digest == trained.data_digest:
             other.verify()
             return other
     return found or find_data(folder, trained)
+
+
+def _readable(folder: Path) -> Split | None:
+    """A split that lies beside the one asked for, None where it is damaged: it may be anybody's."""
+    try:
+        return Split(folder)
+    except StoreError:
+        return None
 
 
 def _with_offsets(frames: Frames, fitted: Fitted) -> Frames:

@@ -19,6 +19,8 @@ from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import farthest_points, k_means
 from scapo.paper.vector_neurons import uniform
 
+MOST_BLOCKS = 100  # Of any network: five are published
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JointPairs:
@@ -50,6 +52,11 @@ class JointConfig:
     """The same for prismatic joints, in normalised units."""
     base_fixed: bool = True
     """Hold the parent's state at 0: moving the base is the same as moving the object."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for more blocks than any network has, as damaged files ask for."""
+        if not 1 <= self.blocks <= MOST_BLOCKS:
+            raise ValueError(f"blocks: expected 1 to {MOST_BLOCKS}, found {self.blocks}")
 
 
 def thin(points: Float[Tensor, "B N 3"], count: int) -> Float[Tensor, "B K 3"]:

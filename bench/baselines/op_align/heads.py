@@ -20,7 +20,7 @@ from scapo.categories import Category, JointKind
 from scapo.equivariant.layers import ChannelNorm
 from scapo.geometry.numerics import at_least_float32, exact
 from scapo.geometry.rotations import rotvec_to_rotmat
-from scapo.paper.heads import JointPairs, ResidualBlock
+from scapo.paper.heads import MOST_BLOCKS, JointPairs, ResidualBlock
 from scapo.paper.vector_neurons import uniform
 
 RESIDUAL_RANGE = math.pi / 10
@@ -153,6 +153,11 @@ class PointNetConfig:
     """Width of the interval of states, rad (120 degrees)."""
     prismatic_range: float = 2.0944
     """The same for prismatic joints, in normalised units: the published code has one number."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for more blocks than any network has, as damaged files ask for."""
+        if not 1 <= self.blocks <= MOST_BLOCKS:
+            raise ValueError(f"blocks: expected 1 to {MOST_BLOCKS}, found {self.blocks}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -113,7 +113,7 @@ def test_the_card_tells_the_scores_of_this_run(folder: Path):
     ("change", "message"),
     [
         ({"finished": False}, "expected a finished run"),
-        ({"config": {"preset": "none"}}, "expected one of paper, cpu"),
+        ({"config": {"preset": "none"}}, "expected one of paper, literal, cpu"),
     ],
 )
 def test_what_cannot_be_released(folder: Path, change, message: str, capsys):

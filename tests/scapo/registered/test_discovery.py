@@ -132,7 +132,7 @@ def test_the_mirror_image_that_completes_the_base_is_kept(
 ) -> None:
     """Rounds left out, as if all views had been placed right: the judges choose."""
     caplog.set_level("INFO", "scapo.registered.discovery")
-    views, truth = sighted(12, seed=91)
+    views, truth = sighted(28, seed=91)
     anywhere: list[bool] = []
 
     def placed(one: Candidate, *_: object, **options: bool) -> Candidate:
@@ -158,7 +158,7 @@ def test_the_mirror_image_that_completes_the_base_is_kept(
 @pytest.mark.slow
 def test_views_of_a_side_that_inliers_never_saw_find_it() -> None:
     """A round on a mirrored base: its views are placed on that side, which they rebuild."""
-    views, truth = sighted(20, seed=91)
+    views, truth = sighted(28, seed=91)
     config = DiscoveryConfig(rotations=300, template_points=200, final_points=600)
     cameras = Inliers(views=views, placement=truth).cameras()
     seen = (cameras[:, 1] < -0.1).nonzero()[:, 0]
