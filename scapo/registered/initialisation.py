@@ -92,7 +92,7 @@ def combined(
     if len(proposals) == 1:
         return [(one,) for one in proposals[0][:starts]]
     first, *others = proposals
-    alike = [
+    alike: list[tuple[JointProposal, ...]] = [
         (one, *(max(more, key=lambda x: abs(float(x.axis @ one.axis))) for more in others))
         for one in first
     ]

@@ -33,7 +33,7 @@ def main(root: Path) -> None:
         shards = [load_file(path) for path in sorted(folder.glob("*.safetensors"))]
         alike = np.concatenate([shard["alike"] for shard in shards])[:, 1:] > 0
         above = elevation(np.concatenate([shard["camera_T_part"][:, 0] for shard in shards]))
-        any_turn = alike.any(1)
+        any_turn = np.asarray(alike.any(1))
         turns = " ".join(str(turn + 1) for turn in np.flatnonzero(alike.any(0)))
         bands = [
             f"{low} to {high}: {100 * any_turn[here].mean():.0f} % ({here.sum()})"
