@@ -34,7 +34,7 @@ class Model:
     @property
     def is_aligned(self) -> bool:
         """Whether its frames, order of parts and states are the category's."""
-        return self.calibration is not None or bool(self.predictor.model.supervision)
+        return self.calibration is not None or "pose" in self.predictor.model.supervision
 
     def alignment(self) -> Alignment:
         """From its own conventions to the category's."""

@@ -111,8 +111,9 @@ def first_fit(
         placement, _ = bundle_adjust(
             template, views, placement, options, states=states, generator=generator
         )
-        if number == 0 and config.way_out and "prismatic" in kinds:
-            placement = choose_axes(template, placement, torch.eye(3))
+        if number == 0 and "prismatic" in kinds:
+            if config.way_out:
+                placement = choose_axes(template, placement, torch.eye(3))
             axis_weight = config.axis_weight
         placement = settle_hinges(template, placement)
         rebuild(template, views, placement, generator=generator)

@@ -45,7 +45,12 @@ class DiscoveryConfig(TemplateConfig):
     """Proposed axes that are fitted; where joints are several, of those that look the same way, and
     the best of each."""
     draws: int = 3
-    """Draws of views to register: how many of their poses agree is a matter of luck."""
+    """Draws of views to register: how many of their poses agree is a matter of luck. Where it is
+    known which views show one object, `objects` take their place."""
+    objects: int = 24
+    """Objects of which views are registered with one another."""
+    object_views: int = 20
+    """Views of each of them."""
     contenders: int = 2
     """First templates of each draw, those of least loss, that held-out views judge."""
     finalists: int = 3

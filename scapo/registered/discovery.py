@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Discovery: from bare views to an articulated template, without labels and without a network.
 
-Several draws of views give first templates (`initialisation`). Then come rounds of search (every
+Several draws of views give first templates (`initialisation`), or of objects of each of which a few
+views are known (`objects`). Then come rounds of search (every
 view over rotations and states) and bundle adjustment on the inliers, a larger share each round.
 Views that are held out judge which templates enter the rungs of this tournament by halving, which
 one goes on to the end, and whether it goes on with a mirror image of its base.
@@ -15,6 +16,7 @@ judged against the one without, after both went through a round.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,6 +28,7 @@ from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import first_candidates
+from scapo.registered.objects import object_candidate
 from scapo.registered.pose_search import SearchResult, find_inliers, search_views, unexplained
 from scapo.registered.template import SPAN, ArticulatedTemplate, spread_out, surface_features
 from scapo.registered.views import PartialViews
@@ -49,13 +52,27 @@ def discover(
     kinds: tuple[JointKind, ...],
     config: DiscoveryConfig,
     generator: torch.Generator,
+    objects: Sequence[PartialViews] = (),
 ) -> Discovery:
-    """The articulated template of views of one category, and its placement in all of them."""
+    """The articulated template of views of one category, and its placement in all of them.
+
+    Args:
+        views: All that is learned from.
+        kinds: Of the joints.
+        config: How much is tried.
+        generator: Of all that is drawn.
+        objects: Views of one object each, where it is known which show the same.
+    """
     judges, others = held_out(views, config.judged)
     total = len(others.points)
     half = take(others, evenly(total, config.searched // 2))
     searched = take(others, evenly(total, config.searched))
-    candidates = _first(others, judges, kinds, config, generator)
+    if objects:  # whose own motions told the axes
+        config = replace(config, way_out=False)
+        tried = [object_candidate(objects, kinds, config, generator)]
+    else:
+        tried = _of_draws(others, kinds, config, generator)
+    candidates = leaders(tried, judges, config.finalists, config)
     for share in config.heats:
         candidates = [advance(one, half, share, config, generator) for one in candidates]
     best, shares = leaders(candidates, judges, 1, config)[0], config.trusted
@@ -82,21 +99,20 @@ def held_out(views: PartialViews, count: int) -> tuple[PartialViews, PartialView
     return take(views, judges), take(views, rest.nonzero()[:, 0])
 
 
-def _first(
+def _of_draws(
     views: PartialViews,
-    judges: PartialViews,
     kinds: tuple[JointKind, ...],
     config: DiscoveryConfig,
     generator: torch.Generator,
 ) -> list[Candidate]:
-    """The best of the first candidates of all draws."""
+    """The first candidates of all draws of views."""
     total, tried = len(views.points), list[Candidate]()
     for draw in range(config.draws):
         seeds = (evenly(total, config.seeds) + STRIDE * draw) % total
         found = first_candidates(take(views, seeds), kinds, config, generator)
         tried += found[: config.contenders]
         logger.info("draw %d of %d: %d first templates", draw + 1, config.draws, len(tried))
-    return leaders(tried, judges, config.finalists, config)
+    return tried
 
 
 def leaders(

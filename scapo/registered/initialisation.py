@@ -21,7 +21,7 @@ from scapo.registered.bundle_adjustment import Candidate, Inliers, first_fit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.gauge import principal_frame
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
-from scapo.registered.pairwise import register_pairs, rotation_grid
+from scapo.registered.pairwise import HIDDEN_COST, register_pairs, rotation_grid
 from scapo.registered.synchronisation import synchronise
 from scapo.registered.template import ArticulatedTemplate, Placement, spread_out, surface_features
 from scapo.registered.views import PartialViews
@@ -39,16 +39,27 @@ def first_candidates(
     generator: torch.Generator,
 ) -> list[Candidate]:
     """Templates from views of which nothing is known, those with the least loss first."""
-    return fitted_proposals(common_frame(views, config), kinds, config, generator)
+    posed = common_frame(views, config.rotations, config.agreeing)
+    return fitted_proposals(posed, kinds, config, generator)
 
 
-def common_frame(views: PartialViews, config: DiscoveryConfig) -> PosedViews:
-    """The views that agree best, in one frame along the object's main directions."""
+def common_frame(
+    views: PartialViews, rotations: int, share: float, hidden_cost: float = HIDDEN_COST
+) -> PosedViews:
+    """That share of the views, those that agree best, in one frame along main directions.
+
+    Args:
+        views: Each is registered with every other.
+        rotations: How many are tried for each pair.
+        share: Of the views.
+        hidden_cost: Of `register_pairs`.
+    """
     count = len(views.points)
     pairs = torch.combinations(torch.arange(count)).flip(-1)
-    modes = register_pairs(views, pairs, rotations=rotation_grid(config.rotations))
+    grid = rotation_grid(rotations)
+    modes = register_pairs(views, pairs, rotations=grid, hidden_cost=hidden_cost)
     poses = synchronise(count, pairs, modes)
-    kept = poses.confidence.topk(max(LEAST_VIEWS, round(config.agreeing * count))).indices
+    kept = poses.confidence.topk(max(LEAST_VIEWS, round(share * count))).indices
     views, poses = take(views, kept), take(poses, kept)
     rotation, translation = poses.rotation, poses.translation
     normals = views.normals[:, ::FRAME_EVERY] @ rotation.mT
@@ -73,7 +84,8 @@ def fitted_proposals(
     none = torch.zeros(len(posed.rotation), len(kinds))
     tried: list[tuple[float, Candidate]] = []
     for combination in combined(proposals, config.starts):
-        template = first_template(posed, moved, combination, kinds, config.template_points)
+        surface = posed.world(moved[0].shape[1])
+        template = first_template(surface, moved, combination, kinds, config.template_points)
         placement = Placement.at(posed.rotation, posed.translation, none)
         placement, loss = first_fit(template, posed.views, placement, config, generator)
         inliers = Inliers(views=posed.views, placement=placement)
@@ -105,14 +117,22 @@ def combined(
 
 
 def first_template(
-    posed: PosedViews,
+    surface: tuple[Float[Tensor, "B K 3"], Float[Tensor, "B K 3"]],
     moved: tuple[Bool[Tensor, "B K"], ...],
     joints: tuple[JointProposal, ...],
     kinds: tuple[JointKind, ...],
     count: int,
 ) -> ArticulatedTemplate:
-    """Still points as base and moved points as parts, the proposed joints between them."""
-    points, normals = (x.flatten(0, 1) for x in posed.world(moved[0].shape[1]))
+    """Still points as base and moved points as parts, the proposed joints between them.
+
+    Args:
+        surface: Points of the views in the template's frame, and their normals.
+        moved: Which of them each joint moved.
+        joints: In that frame.
+        kinds: Of the joints.
+        count: Points of the template.
+    """
+    points, normals = (x.flatten(0, 1) for x in surface)
     label = torch.zeros_like(moved[0], dtype=torch.long)
     for j, rows in enumerate(moved):
         label[rows] = j + 1

@@ -35,9 +35,9 @@ LEAST_MOVED = 12  # Points of a view that must have moved for it to be in a pair
 CARRIED = 40  # Points of a view that are carried by every candidate motion, those that moved first
 TIE = 0.01  # Largest random number by which points are drawn among those that moved alike
 AWAY = 9.0  # Normalised place of points that did not move: nothing is carried there
-OPENED, TURNED = (0.06, 0.5), (math.radians(12), math.radians(100))
+OPENED, TURNED = (0.06, 0.5), (math.radians(8), math.radians(100))
 """Least and largest amount that is tried, to either side: normalised length, and rad."""
-AMOUNTS = 6  # Amounts to either side
+AMOUNTS = 12  # Amounts to either side: coarser ones pass by where long thin parts lie
 PIVOTS, BEYOND = 9, 0.08
 """Places of a hinge along either direction across it, up to this far beyond the moved points."""
 SHARPNESS = 300.0  # Of `match_weight`, per squared normalised length

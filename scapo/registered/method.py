@@ -16,6 +16,7 @@ it.
 
 from __future__ import annotations
 
+import logging
 from abc import abstractmethod
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
@@ -46,6 +47,7 @@ from scapo.registered.network import (
     procrustes,
     vote_losses,
 )
+from scapo.registered.objects import grouped
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
     BRIEF,
@@ -69,6 +71,8 @@ from scapo.registered.template import (
 from scapo.registered.view_bank import ShownPoints, ViewBank
 from scapo.registered.views import NEIGHBOURS, PartialViews, observe
 from scapo.types import Labels, Observation, Prediction, Supervision
+
+logger = logging.getLogger(__name__)
 
 LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
 SAMPLED = 2  # Times `points` that are drawn from a cloud, of which the farthest are learned from
@@ -119,6 +123,8 @@ class RegisteredConfig(SearchConfig):
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     """The search for the template."""
+    supervision: tuple[Literal["instance"], ...] = ("instance",)
+    """What is known of the training clouds: which of them show the same object, or nothing."""
 
 
 def cpu_config() -> RegisteredConfig:
@@ -192,10 +198,7 @@ class AbstractRegistered(AbstractMethod):
             )
         index = evenly(len(observation.points), self.config.learned)
         cloud = observation.points[index.to(observation.points.device)].cpu()
-        inlier = self._inlier_mask(cloud)
-        points, similarity = normalise(replaced(cloud, inlier))
-        camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
-        views = observe(points, camera, count=self.config.points)
+        similarity, views, inlier = self._observed(cloud)
         device = self.template.points.device
         self.template.cpu()  # many small steps, view by view: no work for a GPU
         seed = torch.randint(2**31, (1,), generator=generator, device=generator.device)
@@ -205,6 +208,15 @@ class AbstractRegistered(AbstractMethod):
         self._set_pseudo_labels(cloud[:, 0], views, made.found)
         self.pseudo.belonging = inlier
         self.to(device)
+
+    def _observed(
+        self, cloud: Float[Tensor, "B N 3"]
+    ) -> tuple[Similarity, PartialViews, Bool[Tensor, "B N"]]:
+        """Clouds of the training data as views, their normalisation and their inliers."""
+        inlier = self._inlier_mask(cloud)
+        points, similarity = normalise(replaced(cloud, inlier))
+        camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
+        return similarity, observe(points, camera, count=self.config.points), inlier
 
     @abstractmethod
     def _found(
@@ -443,10 +455,17 @@ class AbstractRegistered(AbstractMethod):
 
 
 class RegisteredScapo(AbstractRegistered):
-    """SCAPO for partial views: the template is discovered, without labels."""
+    """SCAPO for partial views: the template is discovered, without labels of poses or parts."""
 
     name: ClassVar[str] = "registered"
-    supervision: frozenset[Supervision] = frozenset()
+    config: RegisteredConfig
+
+    def __init__(
+        self, config: RegisteredConfig, category: Category, generator: torch.Generator
+    ) -> None:
+        """A method whose template is still empty."""
+        super().__init__(config, category, generator)
+        self.supervision: frozenset[Supervision] = frozenset(config.supervision)
 
     def _found(
         self,
@@ -456,8 +475,14 @@ class RegisteredScapo(AbstractRegistered):
         generator: torch.Generator,
     ) -> Discovery:
         """By registration and bundle adjustment of the views."""
-        del observation, labels
-        return discover(learned.views, self.template.kinds, self.config.discovery, generator)
+        objects = []
+        if labels.instance is not None:
+            groups = grouped(labels.instance.cpu(), self.config.discovery)
+            objects = [self._observed(observation.points[rows].cpu())[1] for rows in groups]
+        if labels.instance is not None and not objects:
+            logger.warning("too few clouds of any one object: which show the same is not used")
+        kinds, config = self.template.kinds, self.config.discovery
+        return discover(learned.views, kinds, config, generator, objects)
 
     def _prediction(
         self,

@@ -24,7 +24,12 @@ from scapo.registered.gauss_newton import by_turn, damped_step, point_equations
 from scapo.registered.view_loss import match_weight, sharpened
 from scapo.registered.views import TINY, PartialViews
 
-HIDDEN_COST = 0.55  # Largest cost of a point about which the other view says nothing
+HIDDEN_COST = 0.55
+"""Largest cost of a point about which the other view says nothing, where two objects differ: what
+overlaps is never the same, so much of it has to."""
+OWN_HIDDEN_COST = 0.25
+"""That for two views of one object, of which what overlaps is the same: two sides that share an
+edge overlap less than two that look alike, but only they match."""
 HIDDEN_BEHIND = 0.05  # Normalised length behind what a camera saw at which a point is hidden
 EXTENT = 0.8  # Half the side of the cube of nearest points; a cloud reaches about 0.6
 CELLS = 28
@@ -148,35 +153,44 @@ class Modes:
     """Mean cost, 0 perfect."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """Views that are registered with one another."""
+
+    views: PartialViews
+    grid: NearestGrid
+    """Of their points."""
+    hidden_cost: float
+    """Largest cost of a point about which the other view says nothing."""
+
+
 def one_way_cost(
-    views: PartialViews,
-    grid: NearestGrid,
+    scene: Scene,
     index: Int[Tensor, " Q"],
     points: Float[Tensor, "Q H K 3"],
     normals: Float[Tensor, "Q H K 3"],
 ) -> Float[Tensor, "Q H"]:
     """Mean cost of oriented points placed into views `index` under H hypotheses."""
-    cost = 1 - grid.match(index, points, normals, SCORED)[1]
-    _, hidden = take(views, index).free_and_hidden(points.flatten(1, 2), HIDDEN_BEHIND)
-    return torch.where(hidden.view_as(cost), cost.clamp_max(HIDDEN_COST), cost).mean(-1)
+    cost = 1 - scene.grid.match(index, points, normals, SCORED)[1]
+    _, hidden = take(scene.views, index).free_and_hidden(points.flatten(1, 2), HIDDEN_BEHIND)
+    return torch.where(hidden.view_as(cost), cost.clamp_max(scene.hidden_cost), cost).mean(-1)
 
 
 @torch.no_grad()
 def pair_cost(
-    views: PartialViews,
-    grid: NearestGrid,
+    scene: Scene,
     pairs: Int[Tensor, "Q 2"],
     rotation: Float[Tensor, "Q H 3 3"],
     translation: Float[Tensor, "Q H 3"],
     count: int,
 ) -> Float[Tensor, "Q H"]:
     """Cost of hypotheses target_T_source, both ways, from `count` points of each view."""
-    source, target = pairs[:, 0], pairs[:, 1]
+    source, target, views = pairs[:, 0], pairs[:, 1], scene.views
     points, normals = views.points[:, None, :count], views.normals[:, None, :count]
     there = points[source] @ rotation.mT + translation[:, :, None]
-    forward = one_way_cost(views, grid, target, there, normals[source] @ rotation.mT)
+    forward = one_way_cost(scene, target, there, normals[source] @ rotation.mT)
     back = (points[target] - translation[:, :, None]) @ rotation
-    return (forward + one_way_cost(views, grid, source, back, normals[target] @ rotation)) / 2
+    return (forward + one_way_cost(scene, source, back, normals[target] @ rotation)) / 2
 
 
 @torch.no_grad()
@@ -243,28 +257,38 @@ def icp(
 
 @torch.no_grad()
 def register_pairs(
-    views: PartialViews, pairs: Int[Tensor, "Q 2"], *, rotations: Float[Tensor, "H 3 3"]
+    views: PartialViews,
+    pairs: Int[Tensor, "Q 2"],
+    *,
+    rotations: Float[Tensor, "H 3 3"],
+    hidden_cost: float = HIDDEN_COST,
 ) -> Modes:
     """The `KEPT` best distinct poses of each pair's first view in the frame of its second.
 
     Only rotations under which the two cameras look from the same side are tried: surfaces that
     were seen from opposite sides do not overlap.
+
+    Args:
+        views: All of them.
+        pairs: First and second view of each.
+        rotations: That are tried.
+        hidden_cost: See `OWN_HIDDEN_COST`.
     """
     grid = NearestGrid.build(views.points, views.normals)
-    return cat([_register(views, grid, part, rotations) for part in pairs.split(CHUNK)])
+    scene = Scene(views=views, grid=grid, hidden_cost=hidden_cost)
+    return cat([_register(scene, part, rotations) for part in pairs.split(CHUNK)])
 
 
 def _register(
-    views: PartialViews,
-    grid: NearestGrid,
+    scene: Scene,
     pairs: Int[Tensor, "Q 2"],
     rotations: Float[Tensor, "H 3 3"],
 ) -> Modes:
-    rotation, move = _hypotheses(views, grid, pairs, rotations)
+    rotation, move = _hypotheses(scene, pairs, rotations)
     many = pairs.repeat_interleave(rotation.shape[1], 0)
-    refined = icp(views, many, rotation.flatten(0, 1), move.flatten(0, 1))
+    refined = icp(scene.views, many, rotation.flatten(0, 1), move.flatten(0, 1))
     rotation, translation = (x.unflatten(0, move.shape[:2]) for x in refined)
-    score = pair_cost(views, grid, pairs, rotation, translation, FINAL)
+    score = pair_cost(scene, pairs, rotation, translation, FINAL)
     best = distinct(rotation, score, KEPT, DISTINCT)
     rows = torch.arange(len(pairs), device=best.device)[:, None]
     rotation, translation, score = rotation[rows, best], translation[rows, best], score[rows, best]
@@ -272,27 +296,25 @@ def _register(
 
 
 def _hypotheses(
-    views: PartialViews,
-    grid: NearestGrid,
+    scene: Scene,
     pairs: Int[Tensor, "Q 2"],
     rotations: Float[Tensor, "H 3 3"],
 ) -> tuple[Float[Tensor, "Q K 3 3"], Float[Tensor, "Q K 3"]]:
     """Of each pair the best distinct rotations of the grid and their translations."""
-    camera = views.direction()
+    camera = scene.views.direction()
     side = torch.einsum("hab,qb,qa->qh", rotations, camera[pairs[:, 0]], camera[pairs[:, 1]])
     index = side.topk(round(SAME_SIDE * len(rotations)), dim=-1).indices
-    move = _slide(views, grid, pairs, rotations[index], COARSE)
-    score = pair_cost(views, grid, pairs, rotations[index], move, COARSE)
+    move = _slide(scene, pairs, rotations[index], COARSE)
+    score = pair_cost(scene, pairs, rotations[index], move, COARSE)
     index = index.gather(1, score.topk(LEFT, largest=False).indices)
-    move = _slide(views, grid, pairs, rotations[index], SLID)
-    score = pair_cost(views, grid, pairs, rotations[index], move, FINE)
+    move = _slide(scene, pairs, rotations[index], SLID)
+    score = pair_cost(scene, pairs, rotations[index], move, FINE)
     best = distinct(rotations[index], score, KEPT + SPARE, APART)
     return rotations[index.gather(1, best)], move.gather(1, best[..., None].expand(-1, -1, 3))
 
 
 def _slide(
-    views: PartialViews,
-    grid: NearestGrid,
+    scene: Scene,
     pairs: Int[Tensor, "Q 2"],
     rotation: Float[Tensor, "Q H 3 3"],
     count: int,
@@ -302,10 +324,10 @@ def _slide(
     Centroids of two partial views are not the same point of the object, and a wrong translation
     hides a right rotation.
     """
-    points = (views.points[:, None, :count])[pairs[:, 0]] @ rotation.mT
-    normals = (views.normals[:, None, :count])[pairs[:, 0]] @ rotation.mT
+    points = (scene.views.points[:, None, :count])[pairs[:, 0]] @ rotation.mT
+    normals = (scene.views.normals[:, None, :count])[pairs[:, 0]] @ rotation.mT
     none = rotation.new_zeros(*rotation.shape[:2], 3)
-    return grid.slide(pairs[:, 1], points, normals, none)
+    return scene.grid.slide(pairs[:, 1], points, normals, none)
 
 
 def _unrivalled(

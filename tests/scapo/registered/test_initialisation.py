@@ -40,8 +40,9 @@ def test_still_points_begin_as_base_and_moved_ones_as_parts_of_the_proposed_join
     posed = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
     moved = torch.arange(128).expand(4, 128) % 4 == 0
     joint = JointProposal(axis=AXIS, pivot=PIVOT, score=1.0)
-    made = first_template(posed, (moved,), (joint,), ("revolute",), 60)
-    points, _ = posed.world(128)
+    surface = posed.world(128)
+    made = first_template(surface, (moved,), (joint,), ("revolute",), 60)
+    points, _ = surface
     for part, own in enumerate((~moved, moved)):
         mine = made.points[made.logit.argmax(-1) == part]
         assert len(mine) > 10
