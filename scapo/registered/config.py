@@ -42,8 +42,7 @@ class DiscoveryConfig(TemplateConfig):
     """Share of the searched views, the most confident, that each round keeps as inliers; the first
     round is on half of the views where mirror images are tried."""
     starts: int = 3
-    """Proposed axes that are fitted; where joints are several, of those that look the same way, and
-    the best of each."""
+    """Proposed axes of each joint that are fitted; two of each where joints are several."""
     draws: int = 3
     """Draws of views to register: how many of their poses agree is a matter of luck. Where it is
     known which views show one object, `objects` take their place."""

@@ -7,8 +7,7 @@ joints, and a template is fitted from each.
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Sequence
+from itertools import product
 
 import torch
 import torch.nn.functional as F
@@ -28,6 +27,8 @@ from scapo.registered.views import PartialViews
 
 LEAST_VIEWS = 2  # That a template is first fitted to
 FRAME_EVERY = 4  # Of the normals, one in so many tells the main directions
+AXES_OF_SEVERAL = 2
+"""Proposals of each joint that are fitted, at most, where a category has several joints."""
 TEMPLATE_EVERY = 2  # Of all moved and still points, one in so many may become one of the template's
 SURENESS = 3.0  # Logit of the part that a point begins in
 
@@ -79,11 +80,12 @@ def fitted_proposals(
     config: DiscoveryConfig,
     generator: torch.Generator,
 ) -> list[Candidate]:
-    """A template for combinations of proposed joints, those with the least loss first."""
+    """A template for every combination of proposed joints, those with the least loss first."""
     moved, proposals = zip(*propose_joints(posed, kinds, generator), strict=True)
     none = torch.zeros(len(posed.rotation), len(kinds))
+    each = config.starts if len(kinds) == 1 else min(config.starts, AXES_OF_SEVERAL)
     tried: list[tuple[float, Candidate]] = []
-    for combination in combined(proposals, config.starts):
+    for combination in product(*[found[:each] for found in proposals]):
         surface = posed.world(moved[0].shape[1])
         template = first_template(surface, moved, combination, kinds, config.template_points)
         placement = Placement.at(posed.rotation, posed.translation, none)
@@ -91,29 +93,6 @@ def fitted_proposals(
         inliers = Inliers(views=posed.views, placement=placement)
         tried.append((float(loss.mean()), Candidate(template=template, inliers=inliers)))
     return [candidate for _, candidate in sorted(tried, key=lambda pair: pair[0])]
-
-
-def combined(
-    proposals: Sequence[list[JointProposal]], starts: int
-) -> list[tuple[JointProposal, ...]]:
-    """What is tried of proposed joints: of one all, of several those that look the same way.
-
-    Joints of one object mostly do (temples, handles), and of the axes of one its own moved points
-    may tell little. Beside these the best of each, whichever way.
-    """
-    if len(proposals) == 1:
-        return [(one,) for one in proposals[0][:starts]]
-    first, *others = proposals
-    alike: list[tuple[JointProposal, ...]] = [
-        (one, *(max(more, key=lambda x: abs(float(x.axis @ one.axis))) for more in others))
-        for one in first
-    ]
-    alike.sort(key=lambda joints: -sum(joint.score for joint in joints))
-    best = tuple(found[0] for found in proposals)
-    fitted = alike[:starts]
-    if not any(all(map(operator.is_, best, joints)) for joints in fitted):
-        fitted.append(best)
-    return fitted
 
 
 def first_template(

@@ -10,7 +10,7 @@ import torch
 
 from scapo.geometry.rigid import axis_angle
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.initialisation import combined, first_template, fitted_proposals
+from scapo.registered.initialisation import first_template, fitted_proposals
 from scapo.registered.joint_proposals import JointProposal, PosedViews
 from tests.helpers.sighted import AXIS, PIVOT, sighted
 from tests.helpers.sliding import OUT, UP, cabinet, placements, seen
@@ -49,21 +49,3 @@ def test_still_points_begin_as_base_and_moved_ones_as_parts_of_the_proposed_join
         assert torch.cdist(mine, points[own]).amin(1).max() < 1e-3
     assert torch.equal(made.axis[0], AXIS)
     assert torch.equal(made.pivot[0], PIVOT)
-
-
-def test_joints_of_one_object_are_tried_alike_and_each_at_its_best() -> None:
-    def proposals(*scores: float) -> list[JointProposal]:
-        pivot = torch.zeros(3)
-        made = [
-            JointProposal(axis=axis, pivot=pivot, score=score)
-            for axis, score in zip(torch.eye(3), scores, strict=True)
-        ]
-        return sorted(made, key=lambda one: -one.score)
-
-    def ways(found: list[tuple[JointProposal, ...]]) -> list[tuple[int, ...]]:
-        return [tuple(int(joint.axis.argmax()) for joint in joints) for joints in found]
-
-    two = [proposals(0.3, 0.1, 0.2), proposals(0.1, 0.05, 0.25)]
-    assert ways(combined(two, 3)) == [(2, 2), (0, 0), (1, 1), (0, 2)]
-    assert ways(combined([two[0], two[0]], 2)) == [(0, 0), (2, 2)]
-    assert ways(combined(two[:1], 2)) == [(0,), (2,)]
