@@ -467,6 +467,12 @@ class RegisteredScapo(AbstractRegistered):
         super().__init__(config, category, generator)
         self.supervision: frozenset[Supervision] = frozenset(config.supervision)
 
+    @property
+    def variant(self) -> str:
+        """Options that differ from the default, and whether objects were unknown."""
+        unknown = () if self.supervision else ("objects unknown",)
+        return " ".join((*unknown, *super().variant.split()))
+
     def _found(
         self,
         learned: LearnedClouds,
