@@ -20,10 +20,15 @@ class ScapoConfig:
     preset: Literal["paper", "literal", "cpu", "complete"] = "paper"
     """Where the other defaults come from."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """Sizes of the encoder."""
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    """Sizes of the decoder."""
     joint: JointConfig = field(default_factory=JointConfig)
+    """Sizes of the joint network."""
     heads: HeadConfig = field(default_factory=HeadConfig)
+    """Sizes of the keypoint and residual networks."""
     loss: LossConfig = field(default_factory=LossConfig)
+    """Weights and forms of the loss terms."""
     gamma: float = 0.01
     """Start of the skinning temperature, for a mean radius of 0.25."""
     template_start: Literal["medoid", "random"] = "medoid"
@@ -40,11 +45,15 @@ class ScapoConfig:
     supervision: tuple[Literal["segmentation", "joint"], ...] = ()
     """Labels that training may see: both in Table 2."""
     epochs: tuple[int, ...] = (200, 200)
-    """Of each stage; one number for both."""
+    """Epochs of each stage; one number for both."""
     lr: tuple[float, float] = (1e-3, 1e-4)
+    """Learning rate at the start of each stage."""
     min_lr: float = 1e-6
+    """Learning rate at the end of a stage."""
     weight_decay: float = 1e-8
+    """Added to the gradient, times the weights."""
     batch: int = 16
+    """Clouds a step."""
     points: int | None = None
     """Points of a cloud that the encoder sees and a step of training uses; None = all."""
 

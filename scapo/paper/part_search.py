@@ -45,7 +45,7 @@ class SearchConfig:
     steps: tuple[int, ...] = (40, 60, 150)
     """Steps of Adam in each round."""
     points: int = 512
-    """Of the template."""
+    """Points of the template."""
     asked: int = 256
     """Points of each cloud, and of the template, whose nearest is looked for in a step."""
     rate: float = 0.02
