@@ -27,7 +27,7 @@ from tests.helpers.strategies import generator
 from tests.helpers.tiny import tiny_data
 
 NEEDS = {"kiss-matcher": "kiss_matcher"}
-"""Packages of methods that no extra for the bench installs."""
+"""Packages of methods that have an extra of their own."""
 ALL = tuple(
     pytest.param(
         name,

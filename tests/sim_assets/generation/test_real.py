@@ -14,8 +14,8 @@ import pytest
 from scapo.store import open_split
 from sim_assets.__main__ import main
 from sim_assets.describe.card import remake
-from sim_assets.generation.assets import recover
 from sim_assets.generation import benchmark
+from sim_assets.generation.assets import recover
 from sim_assets.generation.benchmark import IDS, IDS_FORMAT, RECORD, pieces, read_record
 from sim_assets.generation.real import KINDS, category_of, real_models
 from sim_assets.models.validate import AssetError
