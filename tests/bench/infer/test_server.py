@@ -41,25 +41,11 @@ def cloud(told) -> bytes:
     return buffer.getvalue()
 
 
-def new_demo(told: Told, folder: Path) -> Demo:
-    folder.mkdir()
-    request = DemoRequest(mode="fast", max_upload=1, queue=60, keep=3)
-    return Demo(request, [told_model(told)], folder)
-
-
 @pytest.fixture
 def demo(told, tmp_path) -> Demo:
-    return new_demo(told, tmp_path / "demo")
-
-
-@pytest.fixture(scope="module")
-def answered(told, cloud, tmp_path_factory) -> tuple[Demo, str]:
-    """With one result, and its key; a page that is none of its own lies beside its folder."""
-    top = tmp_path_factory.mktemp("answered")
-    (top / "secret").mkdir()
-    (top / "secret" / "page.html").write_text("not for you")
-    demo = new_demo(told, top / "demo")
-    return demo, post(demo, cloud).headers["Location"].split("/")[2]
+    (tmp_path / "demo").mkdir()
+    request = DemoRequest(mode="fast", max_upload=1, queue=60, keep=3)
+    return Demo(request, [told_model(told)], tmp_path / "demo")
 
 
 def post(demo: Demo, data: bytes, name: str = "box.npz", **more: Any):
@@ -145,8 +131,10 @@ def test_no_name_becomes_a_path_or_markup(demo, cloud, name, tmp_path):
      "/results/KEY//etc/passwd", "/results/../secret/page.html", "/results/KEY/.made.jsonx",
      "/results/other/page.html", "/results/KEY/", "//etc/passwd"],
 )  # fmt: skip
-def test_nothing_but_results_is_read(answered, path):
-    demo, key = answered
+def test_nothing_but_results_is_read(demo, cloud, path, tmp_path):
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "page.html").write_text("not for you")
+    key = post(demo, cloud).headers["Location"].split("/")[2]
     answer = get(demo, path.replace("KEY", key))
     assert answer.status_code == 404
     assert "not for you" not in answer.text
