@@ -19,7 +19,7 @@ from typing import Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
@@ -83,11 +83,16 @@ class Skeleton:
 
     def laid_over(self, shape: Float[Tensor, "K 3"]) -> Skeleton:
         """With as many points as a shape, each the nearest to one of it that is left."""
-        from scipy.optimize import linear_sum_assignment
+        return replace(self, points=self.points[matched(shape, self.points)])
 
-        cost = torch.cdist(shape, self.points).square()
-        _, column = linear_sum_assignment(cost.cpu().numpy())
-        return replace(self, points=self.points[torch.as_tensor(column)])
+
+def matched(shape: Float[Tensor, "K 3"], points: Float[Tensor, "M 3"]) -> Int[Tensor, " K"]:
+    """For each point of a shape one of the points, none twice, squared distances least in all."""
+    from scipy.optimize import linear_sum_assignment
+
+    cost = torch.cdist(shape, points).square()
+    _, column = linear_sum_assignment(cost.cpu().numpy())
+    return torch.as_tensor(column).to(points.device)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

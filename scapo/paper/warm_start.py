@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""The networks begin at what a trained run of `registered` says of the training clouds.
+
+Not in the paper, whose stage 1 does not canonicalise partial views. Frames, shapes, joints and
+states are read off that run's predictions, which saw no label either: in place of stage 1 the
+encoder learns the frames and the decoder the whole shapes, and stage 2 begins at networks that were
+fitted to the joints and states (`first_targets`). Its losses are the paper's.
+
+Frame `base`: that of the base part, the aligned frame of a network that errs nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from scapo.categories import Category
+from scapo.geometry.points import chamfer, normalise
+from scapo.geometry.rigid import apply, invert, joint_motion
+from scapo.method import AbstractMethod, Mode
+from scapo.paper import losses
+from scapo.paper.autoencoder import Encoding
+from scapo.paper.first_targets import Lying
+from scapo.paper.objectives import LossConfig
+from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
+from scapo.records import cat, map_tensors, take
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.store.checkpoint import (
+    check_header,
+    config_from,
+    header_category,
+    load_arrays,
+    read_checkpoint,
+)
+from scapo.store.schema import StoreError
+from scapo.types import Observation
+
+POINTS = 1024
+"""Of a shape that are learned from: the first, which `registered` leaves spread out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What the run says of clouds, in normalised units."""
+
+    rotation: Float[Tensor, "B 3 3"]
+    """input_R_base."""
+    translation: Float[Tensor, "B 3"]
+    shape: Float[Tensor, "B M 3"]
+    """Base frame, all states 0; the same points in the same order for every cloud."""
+    part: Int[Tensor, "B M"]
+    pivot: Float[Tensor, "B J 3"]
+    """Base frame, as the axis."""
+    axis: Float[Tensor, "B J 3"]
+    state: Float[Tensor, "B J"]
+
+    def observed(self, kinds: Kinds) -> Float[Tensor, "B M 3"]:
+        """The shape with its joints in their states, base frame."""
+        shape = self.shape
+        for j, kind in enumerate(kinds):
+            motion = joint_motion(self.pivot[:, j], self.axis[:, j], self.state[:, j], kind)
+            moved = apply(motion, self.shape)
+            shape = torch.where((self.part == j + 1)[..., None], moved, shape)
+        return shape
+
+    def turned(self, pose: Float[Tensor, "B 4 4"]) -> Told:
+        """Of the same clouds moved by a pose."""
+        moved = apply(pose, self.translation[:, None])[:, 0]
+        return replace(self, rotation=pose[:, :3, :3] @ self.rotation, translation=moved)
+
+    def order(self, shape: Float[Tensor, "K 3"], cloud: int, kinds: Kinds) -> Int[Tensor, " K"]:
+        """Points that are as many and lie as those of a shape, spread over all parts.
+
+        Args:
+            shape: What a decoder says of one of the clouds.
+            cloud: Which.
+            kinds: Of the joints.
+        """
+        number, count = self.shape.shape[1], len(shape)
+        some = torch.arange(count, device=shape.device)
+        some = some * number // count if count <= number else some % number
+        return some[matched(shape, self.observed(kinds)[cloud, some])]
+
+    def skeleton(self, order: Int[Tensor, " K"], spread: float) -> Skeleton:
+        """What the clouds share, of the points that are named, with bones as their parts are."""
+        points, part = self.shape[:, order].mean(0), self.part[0, order]
+        children = [part == j + 1 for j in range(self.state.shape[1])]
+        return replace(
+            split_skeleton(points, children, spread),
+            pivot=self.pivot.mean(0),
+            axis=F.normalize(self.axis.mean(0), dim=-1),
+        )
+
+    def lying(self, order: Int[Tensor, " K"], encoding: Encoding) -> Lying:
+        """The shapes of the points that are named, and how they lie in the encoder's frames."""
+        shape = self.shape[:, order]
+        member = F.one_hot(self.part[:, order], self.state.shape[1] + 1).to(shape)
+        back = encoding.rotation.mT
+        away = self.translation - encoding.translation
+        return Lying(
+            points=shape,
+            keypoints=member.mT @ shape / member.sum(1).clamp_min(1)[..., None],
+            pivot=self.pivot,
+            axis=F.normalize(self.axis.mean(0), dim=-1),
+            turn=back @ self.rotation,
+            shift=(back @ away[..., None])[..., 0],
+            state=self.state,
+        )
+
+
+class WarmStart:
+    """A trained method that is asked for each training cloud once, where it is first needed."""
+
+    def __init__(self, method: AbstractMethod, mode: Mode = "quick") -> None:
+        """A method whose predictions have canonical points with parts, in one order for all."""
+        self.method = method
+        self.mode: Mode = mode
+        self.known: dict[int, Told] = {}
+
+    def of(self, observation: Observation, index: Int[Tensor, " B"]) -> Told:
+        """What it says of clouds.
+
+        Args:
+            observation: The clouds, as the training has them.
+            index: Their rows among all training clouds, by which they are known again.
+        """
+        rows: Sequence[int] = index.tolist()
+        new = [k for k, row in enumerate(rows) if row not in self.known]
+        if new:
+            some = map_tensors(take(observation, torch.tensor(new).to(index)), Tensor.cpu)
+            found = self._ask(some)
+            self.known |= {rows[k]: take(found, torch.tensor([i])) for i, k in enumerate(new)}
+        every = cat([self.known[row] for row in rows])
+        return map_tensors(every, lambda tensor: tensor.to(observation.points.device))
+
+    @torch.no_grad()
+    def _ask(self, observation: Observation) -> Told:
+        said = self.method.predict(observation, self.mode)
+        pose, joints = said.camera_T_part, said.joints
+        shape, part = said.canonical_points, said.canonical_part
+        if pose is None or joints is None or shape is None or part is None:
+            raise ValueError(f"{self.method.name}: expected poses, joints and a shape with parts")
+        _, similarity = normalise(observation.points)
+        scale, base = similarity.scale[:, None], pose[:, 0]
+        slide = torch.tensor([one.kind == "prismatic" for one in self.method.category.joints])
+        return Told(
+            rotation=base[:, :3, :3],
+            translation=similarity.forward(base[:, None, :3, 3])[:, 0],
+            shape=shape[:, :POINTS] * scale[..., None],
+            part=part[:, :POINTS],
+            pivot=apply(invert(base), joints.pivot) * scale[..., None],
+            axis=joints.axis @ base[:, :3, :3],
+            state=torch.where(slide, joints.state * scale, joints.state),
+        )
+
+
+def load_run(path: Path, category: Category) -> RegisteredScapo:
+    """The trained model of a `registered` run folder or checkpoint file.
+
+    Raises:
+        StoreError: None there, of another method, or of another category.
+    """
+    arrays, header = read_checkpoint(path)
+    kind = header_category(check_header(header, str(path)), str(path))
+    if header["method"] != RegisteredScapo.name or kind != category:
+        raise StoreError(
+            f"{path}: expected a run of {RegisteredScapo.name} on {category.name}, found one of "
+            f"{header['method']} on {kind.name}"
+        )
+    config = config_from(RegisteredConfig, header["config"], f"{path}: config")
+    method = RegisteredScapo(config, kind, torch.Generator())
+    load_arrays(method, arrays, path)
+    return method.eval()
+
+
+def imitation(
+    encoding: Encoding,
+    shape: Float[Tensor, "B K 3"],
+    told: Told,
+    kinds: Kinds,
+    config: LossConfig,
+) -> dict[str, Float[Tensor, ""]]:
+    """What takes the place of stage 1's losses: frames as told, and whole shapes in them.
+
+    Args:
+        encoding: Of clouds.
+        shape: S_dec of their codes.
+        told: Of these clouds, in the same frame.
+        kinds: Of the joints.
+        config: Weights of `rec` and `ortho`.
+    """
+    frame = losses.pose_agreement(
+        encoding.rotation, encoding.translation, told.rotation, told.translation
+    )
+    return {
+        "frame": frame,
+        "rec": config.rec * chamfer(told.observed(kinds), shape).mean(),
+        "ortho": config.ortho * losses.orthonormality(encoding.frame),
+    }
