@@ -65,12 +65,13 @@ class Lying:
 
 
 def lying(s: Skeleton, at: Placements) -> Lying:
-    """A skeleton as it was placed: the template's points in three sizes."""
+    """A skeleton as it was placed: in three sizes, its parts where they sit on each body."""
     size = at.size.exp()[:, None]
+    aside = F.pad(at.aside, (0, 0, 1, 0))  # (B, P, 3); the base's is 0
     return Lying(
-        points=s.points * size,
-        keypoints=s.keypoints * size,
-        pivot=s.pivot * size,
+        points=s.points * size + s.weights() @ aside,
+        keypoints=s.keypoints * size + aside,
+        pivot=s.pivot * size + at.aside,
         axis=F.normalize(s.axis, dim=-1),
         turn=rotvec_to_rotmat(at.turn),
         shift=at.shift,

@@ -191,7 +191,7 @@ class Scapo(AbstractMethod):
                 skeleton, own, clouds[some], map_tensors(seen, lambda x: x[some]), generator
             )
         elif config.part_start == "run":
-            told = self._warm().of(take(observation, chosen), chosen)
+            told = self._warm().read(take(observation, chosen), chosen, seen)
             order = told.order(shape, medoid, self.kinds)
             skeleton = told.skeleton(order, config.search.spread)
             self._teach(skeleton, told.lying(order, seen), clouds, seen, generator)
@@ -278,8 +278,8 @@ class Scapo(AbstractMethod):
         points = apply(pose, points)
         if step.stage == CANONICALISE:
             if self.config.part_start == "run":
-                told = self._warm().of(observation, step.index).turned(pose)
                 encoding = self.encoder(points)
+                told = self._warm().read(observation, step.index, encoding, pose)
                 shape, _ = self.decoder(encoding.code)
                 return imitation(encoding, shape, told, self.kinds, config)
             return canonicalisation(self.encoder, self.decoder, points, config, step.generator)

@@ -52,6 +52,9 @@ class SearchConfig:
     """Learning rate of poses and states."""
     reach: float = 1.2
     """States that are tried lie within this many radians either side of 0."""
+    aside: float = 0.4
+    """Weight of the squared shift of a joint on the body, which lets hinges sit elsewhere on each
+    object: without it a far hinge, about which a part slides, tells how bodies differ."""
     spread: float = 0.03
     """Added to the deviations of a part's points where its bone begins."""
     taught: int = 1000
@@ -104,6 +107,8 @@ class Placements:
     shift: Float[Tensor, "B 3"]
     size: Float[Tensor, "B 3"]
     """Logarithms of the scales along the template's axes."""
+    aside: Float[Tensor, "B J 3"]
+    """Of a joint and its part on the base; template frame, after scaling."""
     state: Float[Tensor, "B J"]
 
 
@@ -120,7 +125,13 @@ def having(of: T, new: Iterable[Tensor]) -> T:
 def motionless(clouds: Float[Tensor, "B N 3"], joints: int) -> Placements:
     """Where everything begins."""
     zero = clouds.new_zeros(len(clouds), 3)
-    return Placements(turn=zero, shift=zero, size=zero, state=clouds.new_zeros(len(clouds), joints))
+    return Placements(
+        turn=zero,
+        shift=zero,
+        size=zero,
+        aside=clouds.new_zeros(len(clouds), joints, 3),
+        state=clouds.new_zeros(len(clouds), joints),
+    )
 
 
 def posed(s: Skeleton, at: Placements, kinds: Kinds) -> Float[Tensor, "B M 3"]:
@@ -134,6 +145,7 @@ def posed(s: Skeleton, at: Placements, kinds: Kinds) -> Float[Tensor, "B M 3"]:
     ]
     weights = s.weights().expand(len(size), -1, -1)
     moved = deform(torch.stack([eye, *moves], 1), points, weights)
+    moved = moved + weights[..., 1:] @ at.aside
     return moved @ rotvec_to_rotmat(at.turn).mT + at.shift[:, None]
 
 
@@ -328,7 +340,7 @@ class PartSearch:
         at = self.with_best_states(clouds, s, at) if moves else at
         own = [value.clone().requires_grad_() for value in values(at)]
         common = [value.clone().requires_grad_(shared) for value in values(s)]
-        learning = own[: None if moves else -1] + common * shared
+        learning = own[: None if moves else -2] + common * shared
         rates = [c.rate] * (len(learning) - len(RATES) * shared) + [
             c.rate * rate for rate in RATES
         ] * shared
@@ -342,6 +354,7 @@ class PartSearch:
                 group["lr"] = rate * 0.1 ** (k / steps)
             cost = misfit(clouds, posed(s, at, self.kinds), c.asked, k).mean()
             cost = cost + 0.05 * at.size.square().mean() + (held(s, at) if shared else 0.0)
+            cost = cost + c.aside * at.aside.square().sum(-1).mean()
             optimizer.zero_grad()
             cost.backward()
             optimizer.step()

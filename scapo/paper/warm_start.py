@@ -22,7 +22,7 @@ from torch import Tensor
 
 from scapo.categories import Category
 from scapo.geometry.points import chamfer, normalise
-from scapo.geometry.rigid import apply, invert, joint_motion
+from scapo.geometry.rigid import apply, invert, joint_motion, rigid
 from scapo.method import AbstractMethod, Mode
 from scapo.paper import losses
 from scapo.paper.autoencoder import Encoding
@@ -69,6 +69,25 @@ class Told:
             shape = torch.where((self.part == j + 1)[..., None], moved, shape)
         return shape
 
+    def exchanged(self, exchange: Exchange) -> Told:
+        """The same surfaces in the same places, told as if base and child were each other.
+
+        The new base is the old child seen through the half turn about the cloud's own pivot, which
+        reverses the axis; so the motion of the old base against the old child has the old state.
+        """
+        turn, pivot, state = exchange.turn, self.pivot[:, 0], self.state[:, 0]
+        motion = joint_motion(pivot, self.axis[:, 0], state, "revolute")
+        child = rigid(self.rotation, self.translation) @ motion
+        pose = child @ rigid(turn.expand_as(self.rotation), pivot - pivot @ turn.mT)
+        back = (self.shape[:, exchange.order] - self.pivot) @ turn + self.pivot
+        return replace(self, rotation=pose[:, :3, :3], translation=pose[:, :3, 3], shape=back)
+
+    def nearer(self, other: Told, encoding: Encoding) -> Told:
+        """Of two readings of each cloud the one whose frame is nearer to the encoder's."""
+        gap = [frame_errors(encoding, told) for told in (self, other)]
+        chosen = (gap[1] < gap[0]).long() * len(gap[0])
+        return take(cat([self, other]), chosen + torch.arange(len(gap[0])).to(chosen))
+
     def turned(self, pose: Float[Tensor, "B 4 4"]) -> Told:
         """Of the same clouds moved by a pose."""
         moved = apply(pose, self.translation[:, None])[:, 0]
@@ -114,14 +133,90 @@ class Told:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exchange:
+    """How base and child of a hinge may change places, as the two plates of a laptop."""
+
+    turn: Float[Tensor, "3 3"]
+    """Half a turn about an axis across the hinge, base frame with the states 0."""
+    order: Int[Tensor, " M"]
+    """For each point of a shape, which of the other part comes to lie nearest to it."""
+
+    @staticmethod
+    def of(told: Told) -> Exchange:
+        """The half turn that lays the parts of the mean shape upon each other best."""
+        shape, pivot = told.shape.mean(0), told.pivot.mean((0, 1))
+        axis = F.normalize(told.axis.mean((0, 1)), dim=0)
+        first = F.normalize(shape[told.part[0] == 1].mean(0) - pivot, dim=0)
+        first = F.normalize(first - (first @ axis) * axis, dim=0)
+        angle = torch.arange(0, torch.pi, torch.pi / HALF_TURNS).to(shape)[:, None]
+        across = angle.cos() * first + angle.sin() * torch.linalg.cross(axis, first)
+        turns = 2 * across[:, :, None] * across[:, None] - torch.eye(3).to(shape)
+
+        def gap(turn: Tensor, some: slice) -> Float[Tensor, "M M"]:
+            laid = (shape - pivot) @ turn.mT + pivot
+            part = told.part[0, some]
+            return torch.cdist(shape[some], laid[some]) + APART * (part[:, None] == part)
+
+        thin = slice(None, None, 4)
+        costs = [gap(turn, thin).amin(1).mean() + gap(turn, thin).amin(0).mean() for turn in turns]
+        best = turns[int(torch.stack(costs).argmin())]
+        return Exchange(turn=best, order=gap(best, slice(None)).argmin(1))
+
+
+HALF_TURNS = 120
+"""Axes that are tried."""
+APART = 10.0
+"""Length that is added between points of which none is to be laid upon the other."""
+
+
+def frame_errors(encoding: Encoding, told: Told) -> Float[Tensor, " B"]:
+    """What `pose_agreement` is a mean of."""
+    cosine = F.cosine_similarity(encoding.rotation, told.rotation, dim=-2)
+    return (1 - cosine).mean(1) + (encoding.translation - told.translation).square().mean(1)
+
+
 class WarmStart:
-    """A trained method that is asked for each training cloud once, where it is first needed."""
+    """A trained method that is asked for each training cloud once, where it is first needed.
+
+    Where a symmetry of the category exchanges the two parts, the method cannot tell which is which
+    (nor does the evaluation ask): each cloud then has two readings, and of these the one nearer to
+    what the encoder says is learned.
+    """
 
     def __init__(self, method: AbstractMethod, mode: Mode = "quick") -> None:
         """A method whose predictions have canonical points with parts, in one order for all."""
         self.method = method
         self.mode: Mode = mode
         self.known: dict[int, Told] = {}
+        kinds = [joint.kind for joint in method.category.joints]
+        self.two_readings = method.category.symmetry is not None and kinds == ["revolute"]
+        self.exchange: Exchange | None = None
+
+    def read(
+        self,
+        observation: Observation,
+        index: Int[Tensor, " B"],
+        encoding: Encoding,
+        pose: Float[Tensor, "B 4 4"] | None = None,
+    ) -> Told:
+        """What it says of clouds, in the reading that is nearer to their encoding.
+
+        Args:
+            observation: The clouds, as the training has them.
+            index: Their rows among all training clouds.
+            encoding: What the encoder says of them.
+            pose: How they were moved before that; None: not at all.
+        """
+        told = self.of(observation, index)
+        if self.two_readings and self.exchange is None:
+            self.exchange = Exchange.of(told)
+        moved = told if pose is None else told.turned(pose)
+        return (
+            moved
+            if self.exchange is None
+            else moved.nearer(moved.exchanged(self.exchange), encoding)
+        )
 
     def of(self, observation: Observation, index: Int[Tensor, " B"]) -> Told:
         """What it says of clouds.

@@ -36,6 +36,7 @@ def placements(joints: int, clouds: int = 5) -> Placements:
         turn=0.4 * normal(3, clouds, 3),
         shift=0.1 * normal(4, clouds, 3),
         size=0.1 * normal(5, clouds, 3),
+        aside=0.1 * normal(9, clouds, joints, 3),
         state=normal(6, clouds, joints),
     )
 

@@ -72,13 +72,15 @@ def test_a_skeleton_lies_as_its_placement_says() -> None:
     )
     turn, shift = torch.tensor([[0.1, 0.2, 0.3]]).double(), torch.tensor([[1.0, 2, 3]]).double()
     size = torch.tensor([[0.1, 0.0, -0.1]]).double()
-    at = Placements(turn=turn, shift=shift, size=size, state=torch.tensor([[0.7]]).double())
+    aside = torch.tensor([[[0.05, -0.1, 0.2]]]).double()
+    state = torch.tensor([[0.7]]).double()
+    at = Placements(turn=turn, shift=shift, size=size, aside=aside, state=state)
     sized = points * size.exp()
     motion = joint_motion(
         skeleton.pivot[0] * size.exp()[0], torch.tensor([0.0, 0, 1]).double(),
         torch.tensor(0.7).double(), "revolute",
     )  # fmt: skip
-    sized[20:] = apply(motion, sized[20:])
+    sized[20:] = apply(motion, sized[20:]) + aside[0]
     expected = apply(rigid(rotvec_to_rotmat(turn), shift), sized[None])
     assert_close(posed(skeleton, at, ("revolute",)), expected, atol=1e-6, rtol=0)
     assert misfit(expected, expected, 40).item() == pytest.approx(2e-3)

@@ -21,7 +21,7 @@ from scapo.paper.config import warm_config
 from scapo.paper.first_targets import first_targets
 from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
 from scapo.paper.skinning import cross_maps, deform, part_maps
-from scapo.paper.warm_start import Told, WarmStart, imitation, load_run
+from scapo.paper.warm_start import Exchange, Told, WarmStart, imitation, load_run
 from scapo.store.schema import StoreError
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.placed import Told as Oracle
@@ -109,6 +109,48 @@ def test_the_points_of_a_shape_are_found_again_or_repeated() -> None:
     assert torch.equal(told.order(seen[shuffled], 3, KINDS), shuffled)
     more = told.order(torch.zeros(410, 3), 3, KINDS)
     assert torch.equal(more.bincount(minlength=400), 1 + (torch.arange(400) < 10).long())
+
+
+def test_two_plates_told_the_other_way_round_are_the_same_surfaces() -> None:
+    """A book of two like halves: exchanged it is told alike, and twice exchanged as before."""
+    half = 0.3 * torch.rand(200, 2, generator=generator(6))
+    flat = torch.cat([half, torch.zeros(200, 1)], 1)
+    open_by = torch.tensor([1.1, 1.4, 1.9])
+    still = rotvec_to_rotmat(torch.tensor([-1.3, 0, 0]))  # the canonical state: open by 1.3
+    turn = rotvec_to_rotmat(torch.randn(3, 3, generator=generator(7)))
+    told = Told(
+        rotation=turn,
+        translation=torch.randn(3, 3, generator=generator(8)),
+        shape=torch.cat([flat, (flat * torch.tensor([1.0, 1, -1])) @ still.mT]).expand(3, -1, -1),
+        part=torch.arange(2).repeat_interleave(200).expand(3, -1),
+        pivot=torch.tensor([0.15, 0.0, 0.0]).expand(3, 1, 3),
+        axis=torch.tensor([-1.0, 0.0, 0.0]).expand(3, 1, 3),
+        state=(open_by - 1.3)[:, None],
+    )
+    exchange = Exchange.of(told)
+    assert_close(exchange.turn @ told.axis[0, 0], -told.axis[0, 0], atol=1e-6, rtol=0)
+    other = told.exchanged(exchange)
+    assert_close(other.shape, told.shape, atol=0.03, rtol=0)
+
+    def placed(one: Told) -> Tensor:
+        return one.observed(KINDS) @ one.rotation.mT + one.translation[:, None]
+
+    for mine, its in ((0, 1), (1, 0)):
+        found = placed(other)[:, told.part[0] == mine]
+        assert_close(found.mean(1), placed(told)[:, told.part[0] == its].mean(1), atol=0.02, rtol=0)
+    back = other.exchanged(exchange)
+    assert_close(back.rotation, told.rotation, atol=1e-5, rtol=0)
+    assert_close(back.translation, told.translation, atol=1e-5, rtol=0)
+    encoding = Encoding(
+        frame=turn, rotation=other.rotation, translation=other.translation, code=torch.zeros(3, 1)
+    )
+    assert_close(told.nearer(other, encoding).rotation, other.rotation)
+    mixed = replace(
+        encoding,
+        rotation=torch.stack([turn[0], *other.rotation[1:]]),
+        translation=torch.stack([told.translation[0], *other.translation[1:]]),
+    )
+    assert_close(told.nearer(other, mixed).rotation[0], turn[0])
 
 
 def test_each_cloud_is_asked_about_once() -> None:
