@@ -40,6 +40,8 @@ class SearchConfig:
     """Points of the template around which a part may be."""
     clouds: tuple[int, ...] = (16, 32, 64)
     """Clouds fitted in each round; as many others judge."""
+    alike: int = 4
+    """Times the clouds of the last round that are placed, for those most like the template."""
     kept: tuple[int, ...] = (6, 2)
     """Starts that go on from each round but the last."""
     steps: tuple[int, ...] = (40, 60, 150)
@@ -163,6 +165,23 @@ def misfit(
     return (there + 1e-6).sqrt().mean(-1) + (back + 1e-6).sqrt().mean(-1)
 
 
+@torch.no_grad()
+def unlikeness(
+    clouds: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"], asked: int
+) -> Float[Tensor, " B"]:
+    """Mean distance to the nearest point, both ways, of the points that are not far: `NEAR`."""
+    some, others = _every(clouds, asked, 0), _every(shapes, asked, 0)
+    gaps = []
+    for here, there in ((some, shapes), (others, clouds)):
+        gap = (here - gather(there, nearest(here, there))).norm(dim=-1)
+        gaps.append(gap.sort(-1).values[:, : int(NEAR * gap.shape[1])].mean(-1))
+    return gaps[0] + gaps[1]
+
+
+NEAR = 0.75
+"""Share of the points that tell whether two objects are alike; the others may have moved."""
+
+
 def _every(points: Float[Tensor, "B N 3"], count: int, offset: int) -> Float[Tensor, "B K 3"]:
     step = max(1, points.shape[1] // count)
     return points[:, offset % step :: step]
@@ -280,15 +299,17 @@ class PartSearch:
 
         Args:
             template: A shape of the category in the aligned frame.
-            clouds: Aligned; the first half is fitted, the second judges.
+            clouds: Aligned; of the first half those are fitted that are most like the template, of
+                the second they judge. What two clouds of like objects differ by is what moved.
 
         Returns:
             It, and of each round the misfit of every start, rising.
         """
         c = self.config
-        sides = [half[: c.clouds[-1]] for half in clouds.chunk(2)]
         number = torch.arange(c.points, device=template.device) * len(template) // c.points
-        starts, at = self.starts(template[number], sides)
+        whole = self.in_one_piece(template[number])
+        sides, at = zip(*(self.most_alike(half, whole) for half in clouds.chunk(2)), strict=True)
+        starts = self.starts(whole.points, sides[0], at[0])
         said = []
         for count, steps, kept in zip(c.clouds, c.steps, (*c.kept, 1), strict=True):
             fitted, judged = (having(where, [x[:count] for x in values(where)]) for where in at)
@@ -303,20 +324,37 @@ class PartSearch:
             starts = [ends[k] for k in order[:kept]]
         return starts[0], said
 
-    def starts(
-        self, points: Float[Tensor, "M 3"], sides: list[Float[Tensor, "B N 3"]]
-    ) -> tuple[list[Skeleton], list[Placements]]:
-        """Skeletons of all splits, and the placements of the template as one rigid body."""
+    def in_one_piece(self, points: Float[Tensor, "M 3"]) -> Skeleton:
+        """A template that is to be placed as a rigid body: its parts are any."""
+        some = points[:, 0] > points[:, 0].mean()
+        return split_skeleton(points, [some] * len(self.kinds), self.config.spread)
+
+    def most_alike(
+        self, clouds: Float[Tensor, "B N 3"], whole: Skeleton
+    ) -> tuple[Float[Tensor, "K N 3"], Placements]:
+        """The clouds that a rigid template fits best but for what moved, the best first; how."""
         c, joints = self.config, len(self.kinds)
-        any_child = points[:, 0] > points[:, 0].mean()
-        whole = split_skeleton(points, [any_child] * joints, c.spread)
-        at = [
-            self.descend(side, whole, motionless(side, joints), c.placing, "rigid")[1]
-            for side in sides
-        ]
-        stray = residual(sides[0], posed(whole, at[0], self.kinds), points)
+        still = whole.points.expand(len(clouds), -1, -1)
+        some = clouds[unlikeness(clouds, still, c.asked // 2).argsort()[: c.alike * c.clouds[-1]]]
+        _, at = self.descend(some, whole, motionless(some, joints), c.placing, "rigid")
+        order = unlikeness(some, posed(whole, at, self.kinds), c.asked).argsort()[: c.clouds[-1]]
+        return some[order], having(at, [value[order] for value in values(at)])
+
+    def starts(
+        self, points: Float[Tensor, "M 3"], clouds: Float[Tensor, "B N 3"], at: Placements
+    ) -> list[Skeleton]:
+        """Skeletons of all splits.
+
+        Args:
+            points: Of the template.
+            clouds: Those most like it, the most first.
+            at: Its placements in them as one rigid body.
+        """
+        c, joints, few = self.config, len(self.kinds), self.config.clouds[0]
+        shapes = posed(self.in_one_piece(points), at, self.kinds)
+        stray = residual(clouds[:few], shapes[:few], points)
         some = splits(points, stray, joints, c.seeds)
-        return [split_skeleton(points, children, c.spread) for children in some], at
+        return [split_skeleton(points, children, c.spread) for children in some]
 
     @torch.enable_grad()
     def descend(

@@ -115,6 +115,25 @@ def test_a_skeleton_is_laid_over_a_shape_point_by_point() -> None:
     assert_close(whole.laid_over(shape).points, shape, atol=1e-3, rtol=0)
 
 
+def test_clouds_of_like_objects_come_first_whatever_their_states() -> None:
+    flat = 0.8 * torch.rand(6, 200, 2, generator=generator(7)) - 0.4
+    points = torch.cat([flat, torch.zeros(6, 200, 1)], -1)
+    points[::2] *= torch.tensor([0.6, 1.5, 1.0])  # other objects
+    flap = points[..., 1] > 0.25 * points[..., 1].amax(1, keepdim=True) / 0.4
+    axis, pivot = torch.tensor([1.0, 0, 0]).expand(6, 3), torch.zeros(6, 3)
+    pivot[:, 1] = 0.25
+    states = torch.tensor([0.9, 0.1, 0.9, 0.9, 0.9, 1.7])
+    moved = apply(joint_motion(pivot, axis, states, "revolute"), points)
+    clouds = torch.where(flap[..., None], moved, points)
+    some = replace(CONFIG, clouds=(3, 5), placing=5, points=100)
+    search_of = PartSearch(("revolute",), some)
+    found, at = search_of.most_alike(clouds, search_of.in_one_piece(clouds[3]))
+    assert found.shape[0] == at.state.shape[0] == 5
+    like = {tuple(cloud[0].tolist()) for cloud in clouds[1::2]}
+    assert {tuple(cloud[0].tolist()) for cloud in found[:3]} == like
+    assert torch.equal(at.state, torch.zeros(5, 1))
+
+
 def test_every_round_says_what_its_starts_left() -> None:
     clouds, _ = hinged(torch.tensor([0.6, 1.0, 1.4, 1.8]))
     brief = replace(
