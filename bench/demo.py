@@ -2,15 +2,16 @@
 """`make demo`: the whole idea, by the commands that a user would type.
 
 Renders fresh objects of the categories that have released models, predicts, scores, and prints
-Table 1 with the paper's numbers beside ours; turns one view of each into joints, a URDF and a page
-with sliders. `make demo-train` trains from scratch instead (`--methods`). Pictures and logs go to
-`results/demo/`. Two categories run side by side, one process each. A second run goes on from the
-first: data and finished runs stay.
+Table 1 with the paper's numbers beside ours; turns one depth image of each into joints, a URDF and
+a page with sliders. `make demo-train` trains from scratch instead (`--methods`). Pictures and logs
+go to `results/demo/`. Two categories run side by side, one process each. A second run goes on from
+the first: data and finished runs stay.
 """
 
 from __future__ import annotations
 
 import csv
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -111,12 +111,18 @@ def run_category(demo: Demo, category: str, console: Console) -> None:
 
 
 def take_joints(demo: Demo, steps: Steps) -> None:
-    """One view as a scanner would save it, and what `scapo-bench infer` makes of it."""
-    split = store.open_split(demo.out / "data", steps.category, "test")
-    cloud = demo.out / "scans" / f"{steps.category}.npz"
-    cloud.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(cloud, points=split.arrays("points")["points"][0])
-    steps.bench("infer", str(cloud), "--category", steps.category, "--out", str(demo.out / "twins"))
+    """The first test view's depth image, mask and camera, and what `infer` makes of them."""
+    shown = demo.out / "data" / steps.category / "test" / "images" / "00000"
+    scan = demo.out / "scans" / steps.category
+    scan.parent.mkdir(parents=True, exist_ok=True)
+    files = {"0000.png": ".png", "0000.mask.png": ".mask.png", "intrinsics.json": ".json"}
+    depth, mask, camera = (
+        shutil.copyfile(shown / name, f"{scan}{suffix}") for name, suffix in files.items()
+    )
+    steps.bench(
+        "infer", depth, "--mask", mask, "--intrinsics", camera, "--category", steps.category,
+        "--out", str(demo.out / "twins"),
+    )  # fmt: skip
 
 
 def score(demo: Demo, steps: Steps, method: str, run: Path) -> None:
@@ -141,9 +147,10 @@ def make_data(demo: Demo, steps: Steps, data: str) -> None:
     for split, count in (("train", demo.train), ("test", demo.test)):
         each = VIEWS if not demo.methods else 16 if split == "train" else 10
         instances = max(1, count // each)
+        images = ["--images"] if split == "test" and not demo.methods else []
         steps.data(
             "generate", category, "--out", data, "--split", split, "--count", str(count),
-            "--instances", str(instances), "--workers", "1",
+            "--instances", str(instances), "--workers", "1", *images,
         )  # fmt: skip
     sheet = demo.out / "pictures" / f"{category}-data.png"
     steps.data("preview", f"{data}/{category}/test", "--out", str(sheet))
@@ -237,8 +244,9 @@ def closing_words(demo: Demo, seconds: float) -> str:
     trained = f"trained from scratch on {demo.train} clouds: {', '.join(demo.methods)}"
     models = trained if demo.methods else "answered by the released models, trained without labels"
     twins = f"""
-  twins     {demo.out}/twins/NAME/  of one view each: joints.json, a URDF for simulators, a GLB, and
-            a page with a slider for each joint (open it in a browser)"""
+  twins     {demo.out}/twins/NAME/  of one depth image each ({demo.out}/scans/NAME.png):
+            joints.json, a URDF for simulators, a GLB, and a page with a slider for each joint
+            (open it in a browser)"""
     if demo.methods:
         twins = ""
     return f"""
@@ -249,9 +257,9 @@ and scored.
   pictures  {demo.out}/pictures/  data, predictions (parts coloured, axes drawn){twins}
   logs      {demo.out}/logs/
 
-Next: your own scan (scapo-bench infer FILE --category oven --out DIR), train one yourself
-(make demo-train, or README, "The four steps of real use"), your own models (scapo-data check PATH),
-or your own method (docs/bring-your-own-method.md)."""
+Next: your own depth image or cloud (scapo-bench infer FILE --category oven --out DIR), train one
+yourself (make demo-train, or README, "The four steps of real use"), your own models (scapo-data
+check PATH), or your own method (docs/bring-your-own-method.md)."""
 
 
 if __name__ == "__main__":

@@ -67,6 +67,10 @@ class DataOptions:
     slow). Default: the preset's, random for sim-art."""
     color: bool = False
     """Store the colour of each point."""
+    images: bool = False
+    """Images: write each sample's depth image (16 bit, mm), mask, camera and, with color, RGB as
+    files beside the shards, as `scapo-bench infer` reads them. The shards stay as they are. For
+    protocol joint."""
     ambiguity: bool = False
     """Store which of the 24 turns of a cube look as the object does (docs/ambiguity.md): tensors of
     their own, the others stay as they are. For protocols joint and full."""

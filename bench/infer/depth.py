@@ -2,7 +2,8 @@
 """The object of a depth image: intrinsics, depth in metres, mask, and its points.
 
 Beside `NAME.png` may lie `NAME.mask.png`, and `NAME.json`, `NAME.yaml`, `intrinsics.json` or
-`intrinsics.yaml` with the camera; they are used where no flag says otherwise.
+`intrinsics.yaml` with the camera; they are used where no flag says otherwise. `NAME.rgb.png` may
+lie there too and is not looked at.
 """
 
 from __future__ import annotations
@@ -52,8 +53,8 @@ def companions(path: Path) -> Companions:
 
 
 def is_companion(path: Path) -> bool:
-    """Whether a file is a mask by its name."""
-    return path.name.endswith(".mask.png")
+    """Whether a file is a mask or a colour image by its name."""
+    return path.name.endswith((".mask.png", ".rgb.png"))
 
 
 def read_depth(path: Path, intrinsics: str | None, mask: Path | None, scale: float | None) -> Cloud:

@@ -19,6 +19,7 @@ from scapo.parallel.ray import Engine, open_pool
 from scapo.store.manifest import Manifest, Shard, shards_digest
 from sim_assets.describe.card import CARD, write_card
 from sim_assets.generation.assets import Asset
+from sim_assets.generation.images import has_images
 from sim_assets.generation.ledger import GenerateError, Ledger
 from sim_assets.generation.plan import (
     Entry,
@@ -138,7 +139,7 @@ def generate(
         Ledger(folder, identity, versions) as ledger,
         open_workers(running, request) if pool is None else nullcontext(pool) as workers,
     ):
-        finished = ledger.finished()
+        finished = _finished(ledger, request)
         complete = _complete(ledger, finished)
         if complete is not None:
             if not (folder / CARD).exists():  # killed just before, or made by an older version
@@ -161,6 +162,14 @@ class _Work:
     entries: tuple[Entry, ...]
     refused: Mapping[str, str]
     finished: Mapping[str, ShardDone]
+
+
+def _finished(ledger: Ledger, request: Request) -> dict[str, ShardDone]:
+    """The shards that are there whole, with the pictures that are asked for."""
+    done = ledger.finished()
+    if not request.settings.images:
+        return done
+    return {name: s for name, s in done.items() if has_images(ledger.folder / name, s.count)}
 
 
 def _complete(ledger: Ledger, finished: Mapping[str, ShardDone]) -> Made | None:

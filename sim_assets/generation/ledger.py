@@ -23,6 +23,7 @@ from scapo.store.manifest import Instance, Manifest, ManifestError, read_manifes
 from scapo.store.regular import NOT_OWN, is_odd, read_regular
 from scapo.text import one_line
 from sim_assets.generation.assets import Asset
+from sim_assets.generation.images import remove_unfinished
 from sim_assets.generation.plan import Entry
 from sim_assets.generation.shard import ShardDone, read_done
 
@@ -202,6 +203,7 @@ class Ledger:
     def _look(self) -> None:
         for path in self.folder.glob(".*.tmp"):  # of a run that was killed while writing
             path.unlink(missing_ok=True)
+        remove_unfinished(self.folder)
         self._own()
         if (self.folder / "manifest.json").exists():
             try:

@@ -94,6 +94,8 @@ def make_settings(options: DataOptions) -> Settings:
             f"noise and mask: expected none and exact with protocol full, which has no picture, "
             f"found {options.noise} and {options.mask}"
         )
+    if options.images and protocol != "joint":
+        raise ValueError(f"images: expected protocol joint, found {protocol}")
     if options.ambiguity:
         if protocol == "isolated":
             raise ValueError("ambiguity: expected protocol joint or full, found isolated")
@@ -112,6 +114,7 @@ def make_settings(options: DataOptions) -> Settings:
         noise=options.noise,
         mask=options.mask,
         ambiguity=options.ambiguity,
+        images=options.images,
     )
 
 

@@ -20,6 +20,7 @@ from scapo.parallel.pool import Report, describe_error
 from scapo.store import SAMPLES, read_header, write
 from scapo.store.json_records import from_json
 from sim_assets.generation.assets import Asset
+from sim_assets.generation.images import write_images
 from sim_assets.generation.plan import Entry, Piece, Request, ShardPlan, instance_record
 from sim_assets.generation.request import versions
 from sim_assets.objects import ArticulatedObject
@@ -273,8 +274,9 @@ def _write(
         "versions": job.versions,
         **done,
     }
-    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} if rows else {}
     path = job.folder / job.plan.file
+    rows = write_images(path, rows, job.request.settings.camera)
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]} if rows else {}
     try:
         sha256 = write(path, arrays, header)
     except OSError as error:

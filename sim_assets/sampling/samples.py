@@ -38,6 +38,7 @@ from sim_assets.sampling.cloud import (
     truth,
     visible_pixels,
 )
+from sim_assets.sampling.images import image_rows
 from sim_assets.sampling.presets import find_preset, least_points
 from sim_assets.sampling.viewpoints import (
     Outline,
@@ -50,7 +51,7 @@ from sim_assets.sampling.viewpoints import (
 from sim_assets.sensors.depth_camera import Sensor, measure_some
 
 Row = dict[str, np.ndarray]
-"""One sample: the tensors of docs/data-format.md without their first dimension."""
+"""One sample: the tensors of docs/data-format.md without their first dimension; its pictures."""
 
 Key = tuple[object, ...]
 """Of a view: seeds its random numbers."""
@@ -98,6 +99,8 @@ class Settings:
     mask: Mask = "exact"
     ambiguity: bool = False
     """Say which turns look alike."""
+    images: bool = False
+    """Keep each sample's picture; its other tensors stay as they are."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -198,7 +201,7 @@ class SampleMaker:
         return rows
 
     def _row(self, state: np.ndarray, view: View, rng: np.random.Generator) -> Steps[Row | None]:
-        settings = self.settings
+        settings, images = self.settings, {}
         known = truth(self.thing, state, view.camera_T_object)
         if settings.protocol == "full" and not self.paired:
             visible = np.ones(len(known.camera_T_part))
@@ -215,6 +218,8 @@ class SampleMaker:
                 sensed, seen, settings.camera, settings.points, rng, settings.sampling
             )
             visible = self.surface.visible(frames, settings.camera, known.camera_T_part)
+            if settings.images:
+                images = image_rows(frames[0], settings.camera, rng, self.sensor)
         if not self._enough(cloud):
             return None
         if self.paired:
@@ -228,6 +233,7 @@ class SampleMaker:
             "visible": visible.astype(np.float32),
             "camera": np.array(settings.camera.row(), np.float32),
             **self._alike(state, known.camera_T_part[0]),
+            **images,
         }
 
     def _whole(
