@@ -3,13 +3,13 @@
 """Do exported twins load, and do their joints move them as the true objects move?
 
     python scripts/experiments/twins.py DATA CATEGORY [CATEGORY ...] [--split val] [--count 20]
-        [--predictions FILE] [--bare]
+        [--predictions FILE] [--source MODELS] [--bare]
 
-DATA is a folder of procedural objects (`sim-art-2/clean`). Without `--predictions` the true parts,
-poses and joints stand for the prediction and the model's shape is 1,600 points of the true surface
-(`--bare`: none, the observed points alone), so that what is left is the export's own error. With
-it, of one category, joints and parts are the file's, and so is the shape where it has
-`canonical_points`.
+DATA is a folder of procedural objects (`sim-art-2/clean`), or of the models in MODELS. Without
+`--predictions` the true parts, poses and joints stand for the prediction and the model's shape is
+1,600 points of the true surface (`--bare`: none, the observed points alone), so that what is left
+is the export's own error. With it, of one category, joints and parts are the file's, of the views
+that it answers, and so is the shape where it has `canonical_points`.
 
 Prints a row for each category: objects, hinge directions within 5 degrees, pivots within 5 % of
 the object's diagonal, URDFs that SAPIEN loads and drives through their range, URDFs that yourdfpy
@@ -151,20 +151,24 @@ def predicted_twin(thing: ArticulatedObject, truth: Truth, i: int, row: dict) ->
     )
 
 
-def samples(split: Split, count: int, predictions: Path | None, bare: bool) -> list[Sample]:
-    """One view of each of the first objects."""
-    made: list[Sample] = []
-    opened = None if predictions is None else Predictions(predictions, split)
+def samples(split: Split, given: argparse.Namespace) -> list[Sample]:
+    """One view of each of the first objects, with predictions of those that are answered."""
+    made: dict[int, Sample] = {}
+    opened = None if given.predictions is None else Predictions(given.predictions, split)
     for truth in blocks(split):
         rows = {} if opened is None else opened.rows(truth.first, len(truth))
-        for i in np.unique(truth.instance, return_index=True)[1]:
-            if len(made) == count:
-                return made
-            thing = recover(split.manifest, int(truth.instance[i]))
+        for i, instance in enumerate(truth.instance.tolist()):
             row = {name: array[i] for name, array in rows.items()}
-            twin = predicted_twin(thing, truth, i, row) if row else true_twin(thing, truth, i, bare)
-            made.append(sample(thing, truth, i, twin))
-    return made
+            answered = not row or bool(np.isfinite(row["joint_axis"]).all())
+            if instance in made or not answered or len(made) == given.count:
+                continue
+            thing = recover(split.manifest, instance, given.source)
+            if row:
+                twin = predicted_twin(thing, truth, i, row)
+            else:
+                twin = true_twin(thing, truth, i, given.bare)
+            made[instance] = sample(thing, truth, i, twin)
+    return list(made.values())
 
 
 def sample(thing: ArticulatedObject, truth: Truth, i: int, twin: Twin) -> Sample:
@@ -303,14 +307,14 @@ def main() -> None:
     parser.add_argument("--split", default="val")
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--predictions", type=Path)
+    parser.add_argument("--source", type=Path)
     parser.add_argument("--bare", action="store_true")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     print("category       n  hinge  pivot  SAPIEN  yourdfpy  as observed    other states")
     for category in given.category:
         split = open_split(given.data, category, given.split)
-        found = samples(split, given.count, given.predictions, given.bare)
-        print(measure(category, found), flush=True)
+        print(measure(category, samples(split, given)), flush=True)
 
 
 if __name__ == "__main__":

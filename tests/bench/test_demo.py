@@ -9,7 +9,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bench.demo import TABLE1, Demo, StepError, Steps, cell_text, closing_words, summary
+from bench.demo import (
+    TABLE1,
+    Demo,
+    StepError,
+    Steps,
+    cell_text,
+    closing_words,
+    summary,
+    take_joints,
+)
 
 
 def cell(method: str, source: str, column: str, value: str, block: str = "S") -> dict[str, str]:
@@ -81,3 +90,22 @@ def test_closing_words_name_the_folders_and_what_answered(tmp_path: Path) -> Non
 def test_categories_are_those_of_table_1_that_have_models() -> None:
     assert set(Demo().categories) <= set(TABLE1)
     assert Demo(categories=("drawer",)).categories == ("drawer",)
+
+
+def test_one_depth_image_goes_through_infer_with_its_mask_and_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = tmp_path / "data" / "oven" / "test" / "images" / "00000"
+    shown.mkdir(parents=True)
+    for name in ("0000.png", "0000.mask.png", "0001.png", "intrinsics.json"):
+        (shown / name).write_text(name)
+    asked: list[tuple[str, ...]] = []
+    monkeypatch.setattr(Steps, "bench", lambda steps, *words: asked.append(words))
+    take_joints(Demo(out=tmp_path), Steps(tmp_path, "oven", Console(file=io.StringIO())))
+    scan = tmp_path / "scans" / "oven"
+    assert asked == [
+        ("infer", f"{scan}.png", "--mask", f"{scan}.mask.png", "--intrinsics", f"{scan}.json",
+         "--category", "oven", "--out", f"{tmp_path}/twins")
+    ]  # fmt: skip
+    read = [Path(f"{scan}{suffix}").read_text() for suffix in (".png", ".mask.png", ".json")]
+    assert read == ["0000.png", "0000.mask.png", "intrinsics.json"]
