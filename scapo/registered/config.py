@@ -45,7 +45,7 @@ class DiscoveryConfig(TemplateConfig):
     """Proposed axes of each joint that are fitted; two of each where joints are several."""
     draws: int = 3
     """Draws of views to register: how many of their poses agree is a matter of luck. Where it is
-    known which views show one object, `objects` take their place."""
+    known which views show one object, draws of objects (4 at most), each registered once."""
     objects: int = 24
     """Objects of which views are registered with one another."""
     object_views: int = 20

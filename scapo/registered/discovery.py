@@ -28,13 +28,20 @@ from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import first_candidates
-from scapo.registered.objects import object_candidate
-from scapo.registered.pose_search import SearchResult, find_inliers, search_views, unexplained
+from scapo.registered.objects import known_objects, object_candidates, owned_views
+from scapo.registered.pose_search import (
+    OwnedViews,
+    SearchResult,
+    find_inliers,
+    search_views,
+    unexplained,
+)
 from scapo.registered.template import SPAN, ArticulatedTemplate, spread_out, surface_features
 from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
 
+Searched = PartialViews | OwnedViews
 JUDGES = 4  # At most one view in so many is held out
 STRIDE = 3  # Views by which the draws are apart
 
@@ -65,11 +72,14 @@ def discover(
     """
     judges, others = held_out(views, config.judged)
     total = len(others.points)
-    half = take(others, evenly(total, config.searched // 2))
-    searched = take(others, evenly(total, config.searched))
-    if objects:  # whose own motions told the axes
-        config = replace(config, way_out=False)
-        tried = [object_candidate(objects, kinds, config, generator)]
+    half: Searched = take(others, evenly(total, config.searched // 2))
+    searched: Searched = take(others, evenly(total, config.searched))
+    if objects:
+        config = replace(config, way_out=False)  # the objects' own motions tell the axes
+        known = known_objects(objects, kinds, config, generator)
+        tried = object_candidates(known, kinds, config, generator)
+        half = owned_views(known[: len(known) // 2], config.searched // 2)
+        searched = owned_views(known, config.searched)
     else:
         tried = _of_draws(others, kinds, config, generator)
     candidates = leaders(tried, judges, config.finalists, config)
@@ -83,7 +93,7 @@ def discover(
         logger.info(
             "bundle adjustment of the %d inliers among %d views",
             len(best.inliers.views.points),
-            len(searched.points),
+            config.searched,
         )
     best = densified(best, config, generator)
     if config.leans:
@@ -129,7 +139,7 @@ def leaders(
 
 def advance(
     candidate: Candidate,
-    searched: PartialViews,
+    searched: Searched,
     share: float,
     config: DiscoveryConfig,
     generator: torch.Generator,
@@ -144,7 +154,7 @@ def advance(
 def completed(
     candidate: Candidate,
     judges: PartialViews,
-    searched: PartialViews,
+    searched: Searched,
     config: DiscoveryConfig,
     generator: torch.Generator,
 ) -> Candidate:

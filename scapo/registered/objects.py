@@ -29,6 +29,7 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import common_frame, first_template
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
 from scapo.registered.pairwise import OWN_HIDDEN_COST
+from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
 from scapo.registered.views import TINY, PartialViews
 
@@ -99,17 +100,64 @@ class _Start:
         return replace(still, log_scale=self.log_scale.clone())
 
 
-def object_candidate(
+def owned_views(objects: Sequence[OneObject], count: int) -> OwnedViews:
+    """So many views of the objects, as many of each, or all."""
+    each = max(1, count // len(objects))
+    rows = [evenly(len(one.posed.rotation), each) for one in objects]
+    some = [take(one.posed, index) for one, index in zip(objects, rows, strict=True)]
+    owner = [torch.full((len(index),), k) for k, index in enumerate(rows)]
+    return OwnedViews(
+        views=cat([posed.views for posed in some]),
+        rotation=torch.cat([posed.rotation for posed in some]),
+        owner=torch.cat(owner),
+    )
+
+
+def known_objects(
     objects: Sequence[PartialViews],
     kinds: tuple[JointKind, ...],
     config: DiscoveryConfig,
     generator: torch.Generator,
-) -> Candidate:
-    """The first template of several objects, of each of which some views are given."""
+) -> list[OneObject]:
+    """The objects each by itself, those whose cameras are farthest apart first.
+
+    Where views of two sides of an object were taken for one side, cameras gather.
+    """
     known = [one_object(views, kinds, config, generator) for views in objects]
-    count = min(len(known), max(LEAST_OBJECTS, round(WIDEST * len(known))))
     spread = torch.stack([one.cameras().var(0).sum() for one in known])
-    known = [known[k] for k in spread.topk(count).indices.sort().values.tolist()]
+    return [known[k] for k in spread.argsort(descending=True).tolist()]
+
+
+def object_candidates(
+    objects: Sequence[OneObject],
+    kinds: tuple[JointKind, ...],
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> list[Candidate]:
+    """First templates of those objects that are surest, and of two thirds of them.
+
+    Args:
+        objects: The surest first (`known_objects`).
+        kinds: Of the joints.
+        config: Points of a template, and options of the first fit.
+        generator: Draws points.
+    """
+    widest = objects[: max(LEAST_OBJECTS, round(WIDEST * len(objects)))]
+    draws = [widest, *([one for k, one in enumerate(widest) if k % 3 != d] for d in range(3))]
+    return [
+        object_candidate(draw, kinds, config, generator)
+        for draw in draws[: config.draws]
+        if len(draw) >= LEAST_OBJECTS
+    ]
+
+
+def object_candidate(
+    known: Sequence[OneObject],
+    kinds: tuple[JointKind, ...],
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> Candidate:
+    """The first template of several objects."""
     readings = agreeing(known, kinds)
     halves = torch.stack([x.turn.abs() @ one.half for one, x in _zip(known, readings)])
     size = (halves.log() - halves.log().mean(0)).clamp(-SIZES, SIZES)
@@ -180,7 +228,7 @@ def agreeing(objects: list[OneObject], kinds: tuple[JointKind, ...]) -> list[_Re
     return [some[k] for some, k in _zip(readings, best)]
 
 
-def _zip(first: list, second: list) -> zip:
+def _zip(first: Sequence, second: Sequence) -> zip:
     return zip(first, second, strict=True)
 
 
@@ -252,7 +300,7 @@ def _joined(parts: list[_Start]) -> _Start:
 
 
 def _mean_joints(
-    objects: list[OneObject], readings: list[_Reading], log_scale: Float[Tensor, "O 3"]
+    objects: Sequence[OneObject], readings: list[_Reading], log_scale: Float[Tensor, "O 3"]
 ) -> tuple[JointProposal, ...]:
     """The direction that most of the objects' axes follow, and the middle of their pivots."""
     joints = []

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.method import evenly
@@ -77,6 +77,11 @@ STATES = (150.0, 250.0)  # Sharpness of the losses by which the winner's states 
 STATE_GRID, STATE_EVERY = 13, 2
 """States that are tried then, and one in so many points that they are tried with."""
 STATE_STEPS = StepOptions(steps=5, points=256)  # Steps that follow
+VOTE = 30.0  # How sharply the losses of a view's hypotheses share its vote
+AGREEING, AGREES = 8.0, 25.0
+"""Of exp(-AGREEING angle^2) by which hypotheses support each other, and degrees from the object's
+frame within which one agrees with it."""
+MORE = 0.3  # Share of the views that agree with others of their object, beyond that of bare views
 LOSS_SHARE = 0.5  # Of a placement's loss that counts against its margin when views are ranked
 LEAST_INLIERS = 8  # Views that a template is fitted to at least
 
@@ -136,6 +141,17 @@ class Hypotheses:
         return best_of(self.placement, loss, self.unlike)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnedViews:
+    """Views of several objects, each with its pose in the frame of its own object."""
+
+    views: PartialViews
+    rotation: Float[Tensor, "B 3 3"]
+    """view_R_object"""
+    owner: Int[Tensor, " B"]
+    """Which object a view shows."""
+
+
 def best_of(
     placement: Placement, loss: Float[Tensor, "B F"], unlike: Float[Tensor, "B F"]
 ) -> SearchResult:
@@ -158,9 +174,39 @@ def most_confident(found: SearchResult, share: float) -> Int[Tensor, " K"]:
     return rank_by_confidence(found)[: max(LEAST_INLIERS, round(share * len(found.loss)))]
 
 
+def voted(
+    hypotheses: Hypotheses, limits: JointLimits, searched: OwnedViews
+) -> tuple[SearchResult, Bool[Tensor, " B"]]:
+    """Of each view the hypothesis that most views of its object agree with.
+
+    Single views look alike under turns that differ from view to view; the object's frame in the
+    template is the same for all of them.
+
+    Returns:
+        The placements, and whether a view has a hypothesis that agrees at all.
+    """
+    count = len(searched.owner)
+    state = hypotheses.placement.state.unflatten(0, (count, -1))
+    loss = hypotheses.loss + limits.penalty(state)
+    table = loss + hypotheses.unlike
+    rotation = hypotheses.placement.rotation.unflatten(0, table.shape)
+    frames = rotation.mT @ searched.rotation[:, None]  # template_R_object
+    vote = torch.softmax(-VOTE * table, 1)
+    chosen = torch.zeros_like(table)
+    for number in searched.owner.unique():
+        rows = (searched.owner == number).nonzero()[:, 0]
+        flat = frames[rows].flatten(0, 1).flatten(1)
+        near = torch.exp(-AGREEING * (3 - flat @ flat.mT).clamp_min(0))  # 3 - trace: angle squared
+        best = (near @ vote[rows].flatten()).argmax()
+        chosen[rows] = (frames[rows].flatten(2) @ flat[best]).to(chosen)
+    table = table + NO_RIVAL * ~within(chosen, AGREES)
+    found = best_of(hypotheses.placement, loss, table - loss)
+    return found, within(chosen, AGREES).any(1)
+
+
 def find_inliers(
     candidate: Candidate,
-    views: PartialViews,
+    searched: PartialViews | OwnedViews,
     share: float,
     config: DiscoveryConfig,
     *,
@@ -170,12 +216,18 @@ def find_inliers(
 
     Args:
         candidate: A template with its present inliers, whose states and cameras bound the search.
-        views: B views.
+        searched: B views.
         share: Of them.
         config: Rotations, and the cost of a range of states.
         anywhere: Whether cameras are sought anywhere.
     """
-    found, _ = _within_limits(candidate, search_near(candidate, views, config, anywhere), config)
+    views = searched.views if isinstance(searched, OwnedViews) else searched
+    hypotheses = search_near(candidate, views, config, anywhere)
+    found, limits = _within_limits(candidate, hypotheses, config)
+    if isinstance(searched, OwnedViews):
+        found, agrees = voted(hypotheses, limits, searched)
+        rows = agrees.nonzero()[:, 0]
+        found, views, share = take(found, rows), take(views, rows), min(1.0, share + MORE)
     kept = most_confident(found, share)
     inliers = Inliers(views=take(views, kept), placement=take(found.placement, kept))
     return Candidate(template=candidate.template, inliers=inliers)

@@ -3,13 +3,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from scapo.geometry.rigid import axis_angle, rotation_angle
+from scapo.geometry.rigid import axis_angle, random_rotations, rotation_angle
 from scapo.registered.config import DiscoveryConfig
+from scapo.registered.joint_limits import limits_of
 from scapo.registered.joint_proposals import JointProposal, PosedViews
-from scapo.registered.objects import OneObject, agreeing, grouped, object_candidate, quarter_turns
+from scapo.registered.objects import (
+    OneObject,
+    agreeing,
+    grouped,
+    known_objects,
+    object_candidate,
+    owned_views,
+    quarter_turns,
+)
+from scapo.registered.pose_search import Hypotheses, voted
+from scapo.registered.template import Placement
 from tests.helpers.sighted import AXIS, sighted
 from tests.helpers.strategies import generator
 
@@ -68,13 +81,49 @@ def test_groups_hold_clouds_of_one_object_and_pass_over_those_with_few() -> None
     assert grouped(torch.arange(40), config) == []
 
 
+def test_views_of_each_object_are_owned_by_it() -> None:
+    some = [known(torch.eye(3), seed, (0.2, 0.1, 0.1)) for seed in range(3)]
+    shown = owned_views(some, 12)
+    assert shown.owner.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    assert torch.equal(shown.rotation[4], some[1].posed.rotation[0])
+    assert torch.equal(shown.views.points[7], some[1].posed.views.points[5])
+
+
+def test_views_of_one_object_outvote_turns_that_single_views_prefer() -> None:
+    """Every view has its true pose and three others, one of which it likes better in 4 of 10."""
+    g = generator(0)
+    shown = replace(
+        owned_views([known(torch.eye(3), 0, (0.2, 0.1, 0.1))], 6),
+        rotation=random_rotations(10, g),
+        owner=torch.tensor([0] * 5 + [1] * 5),
+    )
+    frame = random_rotations(2, g)[shown.owner]  # template_R_object of two objects
+    true = shown.rotation @ frame.mT
+    rotation = torch.cat([true[:, None], random_rotations(30, g).view(10, 3, 3, 3)], 1)
+    loss = torch.full((10, 4), 0.5)
+    loss[:, 0], loss[::5, 1], loss[1::5, 2] = 0.4, 0.38, 0.38
+    turn = rotation.flatten(0, 1)
+    placement = Placement.at(turn, torch.zeros(40, 3), torch.zeros(40, 1))
+    hypotheses = Hypotheses(placement=placement, loss=loss, unlike=torch.zeros(10, 4))
+    limits = limits_of(torch.linspace(-1, 1, 10)[:, None], ("revolute",))
+    alone = hypotheses.best(limits)
+    assert int((rotation_angle(alone.placement.rotation, true) > 0.1).sum()) == 4
+    found, agrees = voted(hypotheses, limits, shown)
+    assert agrees.all()
+    assert float(rotation_angle(found.placement.rotation, true).max()) < 1e-3
+    rotation[3] = random_rotations(4, g)  # a view none of whose hypotheses is right
+    turned = replace(hypotheses, placement=replace(placement, rotation=rotation.flatten(0, 1)))
+    assert voted(turned, limits, shown)[1].tolist() == [True] * 3 + [False] + [True] * 6
+
+
 @pytest.mark.slow
 def test_a_template_is_found_from_views_of_a_few_objects() -> None:
     """Rotations of the views of four boxes with a flap, and the flap's axis."""
     some = [sighted(8, seed=50 * k) for k in range(4)]
     config = DiscoveryConfig(rotations=300, template_points=150)
     with_truth = {tuple(v.points[i, 0].tolist()): t.rotation[i] for v, t in some for i in range(8)}
-    found = object_candidate([v for v, _ in some], ("revolute",), config, generator(0))
+    shown = known_objects([v for v, _ in some], ("revolute",), config, generator(0))
+    found = object_candidate(shown, ("revolute",), config, generator(0))
     views, placement = found.inliers.views, found.inliers.placement
     truth = torch.stack([with_truth[tuple(p.tolist())] for p in views.points[:, 0]])
     common = placement.rotation.mT @ truth
