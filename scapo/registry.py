@@ -88,7 +88,6 @@ LIBRARY: dict[str, Method] = {
         rank=80,
         maker="scapo.registered.method:RegisteredScapo",
         presets={"cpu": "scapo.registered.method:cpu_config"},
-        supervision=("instance",),
         camera=True,
     ),
     "registered-labelled": Method(

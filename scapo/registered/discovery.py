@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Discovery: from views to an articulated template, without poses, parts, joints or a network.
+"""Discovery: from bare views to an articulated template, without labels and without a network.
 
 Several draws of views give first templates (`initialisation`), or of objects of each of which a few
 views are known (`objects`). Then come rounds of search (every

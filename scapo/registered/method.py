@@ -123,8 +123,8 @@ class RegisteredConfig(SearchConfig):
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     """The search for the template."""
-    supervision: tuple[Literal["instance"], ...] = ("instance",)
-    """What is known of the training clouds: which of them show the same object, or nothing."""
+    supervision: tuple[Literal["instance"], ...] = ()
+    """What is known of the training clouds: nothing, or which of them show the same object."""
 
 
 def cpu_config() -> RegisteredConfig:
@@ -171,7 +171,7 @@ class AbstractRegistered(AbstractMethod):
     @property
     def variant(self) -> str:
         """Options that differ from the default, but for how much is trained."""
-        return " ".join(changes(self.config, type(self.config)(), leave=("lr",)))
+        return " ".join(changes(self.config, type(self.config)(), leave=("lr", "supervision")))
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's; the template is found before it starts."""
@@ -469,9 +469,9 @@ class RegisteredScapo(AbstractRegistered):
 
     @property
     def variant(self) -> str:
-        """Options that differ from the default, and whether objects were unknown."""
-        unknown = () if self.supervision else ("objects unknown",)
-        return " ".join((*unknown, *super().variant.split()))
+        """Options that differ from the default, and whether objects were known."""
+        known = ("objects known",) if self.supervision else ()
+        return " ".join((*known, *super().variant.split()))
 
     def _found(
         self,
@@ -481,13 +481,11 @@ class RegisteredScapo(AbstractRegistered):
         generator: torch.Generator,
     ) -> Discovery:
         """By registration and bundle adjustment of the views."""
-        objects = []
-        if labels.instance is not None:
-            groups = grouped(labels.instance.cpu(), self.config.discovery)
-            objects = [self._observed(observation.points[rows].cpu())[1] for rows in groups]
+        kinds, config = self.template.kinds, self.config.discovery
+        groups = [] if labels.instance is None else grouped(labels.instance.cpu(), config)
+        objects = [self._observed(observation.points[rows].cpu())[1] for rows in groups]
         if labels.instance is not None and not objects:
             logger.warning("too few clouds of any one object: which show the same is not used")
-        kinds, config = self.template.kinds, self.config.discovery
         return discover(learned.views, kinds, config, generator, objects)
 
     def _prediction(
