@@ -5,6 +5,8 @@ SHELL := bash
 BIN := .venv/bin
 # Processes of the test run, with one thread each.
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+# A module's tests in one process, since they share what they make; in the order of conftest.py.
+SPREAD = -n $(JOBS) --dist loadscope --no-loadscope-reorder
 ARGS ?=
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
@@ -30,14 +32,14 @@ demo-train: setup ## the same of ovens with a model that is trained from scratch
 	  --methods registered icp $(ARGS)
 
 test: setup ## all tests, shapes checked (JOBS=2, ARGS="-k geometry")
-	@$(BIN)/python -m pytest -n $(JOBS) --dist loadscope --durations=8 $(ARGS)
+	@$(BIN)/python -m pytest $(SPREAD) --durations=8 $(ARGS)
 
 test-quick: setup ## without the slow tests
-	@$(BIN)/python -m pytest -n $(JOBS) --dist loadscope -m "not slow" $(ARGS)
+	@$(BIN)/python -m pytest $(SPREAD) -m "not slow" $(ARGS)
 
 # Shapes unchecked: a checked call that is traced takes three times what either adds alone.
 coverage: setup ## all tests, lines counted: at least 97 %
-	@$(BIN)/python -m pytest -n $(JOBS) --dist loadscope --jaxtyping-packages= --cov --cov-report=term $(ARGS)
+	@$(BIN)/python -m pytest $(SPREAD) --jaxtyping-packages= --cov --cov-report=term $(ARGS)
 
 lint: setup ## ruff, pyright, import contracts
 	@$(BIN)/ruff check .

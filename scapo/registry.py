@@ -80,6 +80,7 @@ LIBRARY: dict[str, Method] = {
             "literal": "scapo.paper.config:literal_config",
             "cpu": "scapo.paper.config:cpu_config",
             "complete": "scapo.paper.config:complete_config",
+            "warm": "scapo.paper.config:warm_config",
         },
     ),
     "registered": Method(

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 LINK = re.compile(r"\]\(([^)\s#:]+)(?:#[^)]*)?\)")
 
 
@@ -51,3 +54,18 @@ def test_links_are_found():
 def test_every_page_is_in_the_navigation_once(pages: list[Path], repository: Path):
     site = yaml.safe_load((repository / "mkdocs.yml").read_text())
     assert sorted(leaves(site["nav"])) == [page.name for page in pages]
+
+
+def test_the_drawing_has_every_room(repository: Path):
+    """Those of the import contracts, which name every file and folder of the packages."""
+    drawing = (repository / "docs" / "architecture.md").read_text().split("```")[1]
+    project = tomllib.loads((repository / "pyproject.toml").read_text())
+    layers = [
+        layer
+        for contract in project["tool"]["importlinter"]["contracts"]
+        if contract.get("containers") in (["bench"], ["scapo"], ["sim_assets"])
+        for layer in contract["layers"]
+    ]
+    rooms = {room for layer in layers for room in re.findall(r"\w+", layer)}
+    assert len(rooms) > 40
+    assert rooms - set(re.findall(r"\w+", drawing)) == {"__main__"}

@@ -41,7 +41,7 @@ class IcpConfig(RegistrationConfig):
     first_iterations: int = 10
     """Those first steps, at most."""
     first_reach: float = 0.8
-    """As `reach`, for the first steps: the centroid of a partial view is off the template's."""
+    """The reach of the first steps: the centroid of a partial view is off the template's."""
 
 
 class Icp(AbstractRegistration):

@@ -63,13 +63,13 @@ class NpcsEpnConfig:
     reach: float = 0.2
     """Distance from an axis within which points vote for it."""
     coordinate_weight: float = 10.0
-    """Of the distance of the part coordinates."""
+    """Weight of the distance of the part coordinates."""
     segmentation_weight: float = 1.0
-    """Of the cross entropy of the part labels."""
+    """Weight of the cross entropy of the part labels."""
     offset_weight: float = 5.0
-    """Of distance and direction to the axis."""
+    """Weight of distance and direction to the axis."""
     axis_weight: float = 0.2
-    """Of the axis's direction, and of the cross entropy of which joint is near."""
+    """Weight of the axis's direction, and of the cross entropy of which joint is near."""
     either_order: bool = True
     """Take the labels or, where parts of the category are exchanged by a symmetry, the exchanged
     ones, whichever costs a cloud less: what the evaluation accepts."""
@@ -80,7 +80,7 @@ class NpcsEpnConfig:
     threshold: float = 0.1
     """Distance within which a point agrees with a pose, in diagonals of the part's box."""
     epochs: int = 200
-    """Of the one stage."""
+    """Epochs of the one stage."""
     lr: float = 1e-3
     """Learning rate of Adam at the start."""
     min_lr: float = 1e-6

@@ -26,9 +26,9 @@ class NetworkConfig:
     widths: tuple[int, ...] = (64, 64, 128, 128, 256)
     """Channels of each block, of each of the 60 anchors."""
     strides: tuple[int, ...] = (2, 1, 2, 1, 2)
-    """Of each block."""
+    """Each block keeps one point of so many."""
     radii: tuple[float, ...] = (0.12, 0.12, 0.24, 0.24, 0.48)
-    """Of the groups of each block."""
+    """Radii of the groups of each block."""
     neighbours: tuple[int, ...] = (32, 16, 32, 16, 32)
     """Most points of a group of each block."""
     frames: int = 8

@@ -42,13 +42,13 @@ class PointNet2Config:
     centres: tuple[int, int] = (512, 128)
     """Groups of the two levels."""
     near_radii: tuple[float, ...] = (0.1, 0.2, 0.4)
-    """Of the groups of points, in units of twice the mean radius."""
+    """Radii of the groups of points, in units of twice the mean radius."""
     near_samples: tuple[int, ...] = (32, 64, 128)
     """Points of a group of each radius."""
     near_widths: tuple[Widths, ...] = ((32, 32, 64), (64, 64, 128), (64, 96, 128))
     """Channels of the layers of each radius."""
     far_radii: tuple[float, ...] = (0.4, 0.8)
-    """The same of the groups of groups."""
+    """Radii of the groups of groups, in the same unit."""
     far_samples: tuple[int, ...] = (64, 128)
     """Groups of a group of each radius."""
     far_widths: tuple[Widths, ...] = ((128, 128, 256), (128, 196, 256))

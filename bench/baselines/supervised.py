@@ -70,15 +70,15 @@ class LearningConfig:
     """Points that the network sees at a time: random ones in training; a prediction goes over all
     points in clouds of at most so many. None: all."""
     segmentation_weight: float = 1.0
-    """Of the cross entropy of the part labels."""
+    """Weight of the cross entropy of the part labels."""
     pose_weight: float = 5.0
-    """Of the distance of the votes, or of rotation and translation when pooled."""
+    """Weight of the distance of the votes, or of rotation and translation when pooled."""
     pivot_weight: float = 5.0
-    """Of the smooth L1 distance of the pivot."""
+    """Weight of the smooth L1 distance of the pivot."""
     axis_weight: float = 1.0
-    """Of 1 - cos of the angle between the axes."""
+    """Weight of 1 - cos of the angle between the axes."""
     epochs: int = 200
-    """Of the one stage."""
+    """Epochs of the one stage."""
     lr: float = 1e-3
     """Learning rate of Adam at the start, on half a cosine from there."""
     min_lr: float = 1e-6

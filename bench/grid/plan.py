@@ -158,6 +158,8 @@ class _Maker:
         self.grid: PresetName = name
         self.preset, self.folder = preset, folder
         self.configs: dict[str, Any] = {}
+        self.made: dict[str, Any] = {}
+        """Configurations, each without that of what it starts from."""
         self.data: dict[str, str | None] = {}
         self.counts: dict[str, int] = {}
         self.seconds: dict[tuple[str, str], float | None] = {}
@@ -175,18 +177,9 @@ class _Maker:
         """Training, then for each mode the frames and every split that is scored."""
         place, name = f"{part}/{category}", f"{category}-{entry.label}-seed{seed}"
         clouds = self.count(f"{place}/train")
-        preset, default = own_preset(entry.method, self.grid)
-        flags = flags_of(entry, preset, self.preset.budget, clouds)
-        if entry.label not in self.configs:
-            self.configs[entry.label] = configuration(entry.method, default, flags)
-        folder = f"runs/{part}/{name}"
-        steps = [Step(
-            kind="train", name="train", output=f"{folder}/checkpoint.safetensors",
-            command=("train", entry.method, "--category", category, "--data", f"{{data}}/{part}",
-                     "--out", f"{{out}}/{folder}", "--seed", str(seed), "--resume", *flags),
-            reads=(f"{place}/train",),
-        )]  # fmt: skip
-        costs = {"train": training_seconds(entry, flags, clouds)}
+        trained = list(self.trainings(entry, place, name, seed))
+        steps = [step for step, _ in trained]
+        costs = {step.name: cost for step, cost in trained}
         scored = [f"{place}/{split}" for split in self.preset.splits
                   if part != "isolated" or split != "test-ood"]  # fmt: skip
         if self.preset.sizes is None and "test" in self.preset.splits and self.has_real(place):
@@ -201,6 +194,38 @@ class _Maker:
                       steps=tuple(steps))  # fmt: skip
         self.seconds |= {(chain.name, step): cost for step, cost in costs.items()}
         return chain
+
+    def trainings(
+        self, entry: Entry, place: str, name: str, seed: int
+    ) -> Iterator[tuple[Step, float | None]]:
+        """The training, after the one that it starts from, with their estimates."""
+        step, cost = self.training(entry, place, name, seed)
+        config = self.made[entry.label]
+        if entry.start is not None:
+            first, its = self.training(entry.start, place, f"{name}-start", seed)
+            config = {**config, "start": self.made[entry.start.label]}
+            yield replace(first, name="start"), its
+            run = Path(first.output).parent
+            step = replace(step, needs=("start",),
+                           command=(*step.command, "--start", f"{{out}}/{run}"))  # fmt: skip
+        self.configs.setdefault(entry.label, config)
+        yield step, cost
+
+    def training(self, entry: Entry, place: str, name: str, seed: int) -> tuple[Step, float | None]:
+        """The training of an entry into the run folder of that name, and its estimate."""
+        part, category = place.split("/")
+        clouds, folder = self.count(f"{place}/train"), f"runs/{part}/{name}"
+        preset, default = own_preset(entry.method, self.grid, entry.preset)
+        flags = flags_of(entry, preset, self.preset.budget, clouds)
+        step = Step(
+            kind="train", name="train", output=f"{folder}/checkpoint.safetensors",
+            command=("train", entry.method, "--category", category, "--data", f"{{data}}/{part}",
+                     "--out", f"{{out}}/{folder}", "--seed", str(seed), "--resume", *flags),
+            reads=(f"{place}/train",),
+        )  # fmt: skip
+        if entry.label not in self.made:
+            self.made[entry.label] = configuration(entry.method, default, flags)
+        return step, training_seconds(entry, flags, clouds)
 
     def of_mode(
         self, entry: Entry, mode: Mode, place: str, name: str, scored: Sequence[str]
@@ -270,9 +295,12 @@ class _Maker:
         return self.counts[split]
 
 
-def own_preset(method: str, name: PresetName) -> tuple[str | None, Any]:
-    """A method's own preset that goes with a grid's, where it has a flag for it; its options."""
-    asked = "paper" if name == "paper" else "cpu"
+def own_preset(method: str, name: PresetName, own: str = "") -> tuple[str | None, Any]:
+    """A method's preset, the one that goes with a grid's if none is named; its options.
+
+    None where it has no flag for it.
+    """
+    asked = own or ("paper" if name == "paper" else "cpu")
     default = METHODS[method].preset(asked)
     return (asked if any(one.name == "preset" for one in fields(default)) else None), default
 

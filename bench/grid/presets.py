@@ -37,6 +37,10 @@ class Entry:
     method: str
     name: str = ""
     """Of this configuration in names of files; by default the method's."""
+    preset: str = ""
+    """Of the method; by default the one that goes with the grid's."""
+    start: Entry | None = None
+    """A training that comes first, into a run of its own, which `--start` names."""
     flags: tuple[str, ...] = ()
     """Of `train`."""
     seeds: tuple[int, ...] = (1,)
@@ -105,7 +109,10 @@ REGISTERED = Entry(
     training=1200,
     seconds={"fast": 0.05, "quick": 0.06, "refine": 0.35},
 )
-GRID = (*NETWORKS, *LABELLED, REGISTERED, *ABLATIONS)
+WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=REGISTERED,
+             parts=("clean", "sensor"), training=1200, seconds={"fast": 0.01})  # fmt: skip
+"""The paper's networks, begun at what the registration method says: SCAPO, warm start."""
+GRID = (*NETWORKS, *LABELLED, REGISTERED, WARM, *ABLATIONS)
 
 PRESETS: Mapping[PresetName, Preset] = {
     "smoke": Preset(

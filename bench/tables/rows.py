@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from bench.methods import all_methods
-from bench.scoring.score_files import Report, Scores
+from bench.scoring.score_files import Counts, Report, Scores
 from bench.tables.model import DASH, Cell, Marks, Row
 from bench.tables.paper import MEAN, Cells, Mismatch
 from bench.tables.results import (
@@ -247,13 +247,25 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
         name = display_name(series_of(run))
         text = (
             f"{name}, {run.run.category} on {run.run.data} ({run.run.split}), "
-            f"{len(run.samples)} samples; labels: {', '.join(run.report.supervision) or 'none'}; "
+            f"{_answered(run.report.counts)}; "
+            f"labels: {', '.join(run.report.supervision) or 'none'}; "
             f"{_cost(run.report)}"
         )
         lines.setdefault(text, set()).add(run.run.seed)
     return tuple(
         f"{text}; seeds {', '.join(map(str, sorted(seeds)))}." for text, seeds in lines.items()
     )
+
+
+def _answered(counts: Counts) -> str:
+    """Samples, and how many of them have an answer: others are in no mean, but fail in precision.
+
+    >>> _answered(Counts(samples=1000, instances=50, unanswered={"part_weight": 700}))
+    '1000 samples, 300 of them answered'
+    """
+    none = max(counts.unanswered.values(), default=0)
+    more = f", {counts.samples - none} of them answered" if none else ""
+    return f"{counts.samples} samples{more}"
 
 
 TOLD = ("device", "processor", "batch", "seconds_per_cloud")

@@ -30,7 +30,7 @@ LEAST_SPACING = 0.005
 """Of the part's diagonal: repeated points are no finer sampling."""
 NOISY = 0.25
 """Spacings of the model's samples, from which noise on observed ones is worse than none of them."""
-STRAY = 0.1
+OUTLIER = 0.1
 """Of the model's diagonal: observed points farther off its samples are no part of the object."""
 REACH = 1.6
 """Radius of the ball, in spacings: gaps up to twice as wide are closed."""
@@ -92,7 +92,7 @@ def joined(model: Samples, seen: Samples) -> Samples:
         return seen if len(seen.points) else model
     spacing = _spacing(model.points)
     diagonal = float(np.linalg.norm(np.ptp(model.points, axis=0)))
-    near = _nearest(KDTree(model.points), seen.points, 1)[0][:, 0] < STRAY * diagonal
+    near = _nearest(KDTree(model.points), seen.points, 1)[0][:, 0] < OUTLIER * diagonal
     if seen.noise > NOISY * spacing or not near.any():
         return model
     seen = Samples(points=seen.points[near], normals=seen.normals[near])

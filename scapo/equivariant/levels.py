@@ -109,7 +109,7 @@ class LevelConfig:
     """One convolution of a network."""
 
     radius: float
-    """Of the groups, in the unit of the points."""
+    """Radius of the groups, in the unit of the points."""
     neighbours: int
     """Most points of a group."""
     stride: int = 1

@@ -17,22 +17,32 @@ from scapo.paper.part_search import SearchConfig
 class ScapoConfig:
     """Everything that can be chosen; the defaults are the paper's values (Sec. 4)."""
 
-    preset: Literal["paper", "literal", "cpu", "complete"] = "paper"
+    preset: Literal["paper", "literal", "cpu", "complete", "warm"] = "paper"
     """Where the other defaults come from."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """Sizes of the encoder."""
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    """Sizes of the decoder."""
     joint: JointConfig = field(default_factory=JointConfig)
+    """Sizes of the joint network."""
     heads: HeadConfig = field(default_factory=HeadConfig)
+    """Sizes of the keypoint and residual networks."""
     loss: LossConfig = field(default_factory=LossConfig)
+    """Weights and forms of the loss terms."""
     gamma: float = 0.01
     """Start of the skinning temperature, for a mean radius of 0.25."""
     template_start: Literal["medoid", "random"] = "medoid"
     """Y_base and K: the decoded medoid of the training codes, or random numbers."""
-    part_start: Literal["means", "search"] = "means"
-    """Bones, joints and networks of stage 2 begin at the P-means of the template, or at what a
-    search of parts explains the clouds best by (not in the paper)."""
+    part_start: Literal["means", "search", "run"] = "means"
+    """Bones, joints and networks of stage 2 begin at the P-means of the template, at what a search
+    of parts explains the clouds best by, or at what a run of `registered` says of them; that run's
+    frames then take the place of stage 1's losses (neither is in the paper)."""
     search: SearchConfig = field(default_factory=SearchConfig)
-    """Used with `part_start` search only."""
+    """Used with `part_start` search; `spread` and `teaching` with run too."""
+    start: str | None = None
+    """Run folder of a trained `registered` of the same category, for `part_start` run."""
+    told: int = 2000
+    """Training clouds that this run is asked for, about 0.06 s each on one core."""
     bones_turn: bool = False
     """V of a bone turns with its part (BANMo); otherwise it is the same in every state."""
     encoder_in_stage_2: Literal["joint", "frozen", "end-to-end"] = "joint"
@@ -40,11 +50,15 @@ class ScapoConfig:
     supervision: tuple[Literal["segmentation", "joint"], ...] = ()
     """Labels that training may see: both in Table 2."""
     epochs: tuple[int, ...] = (200, 200)
-    """Of each stage; one number for both."""
+    """Epochs of each stage; one number for both."""
     lr: tuple[float, float] = (1e-3, 1e-4)
+    """Learning rate at the start of each stage."""
     min_lr: float = 1e-6
+    """Learning rate at the end of a stage."""
     weight_decay: float = 1e-8
+    """Added to the gradient, times the weights."""
     batch: int = 16
+    """Clouds a step."""
     points: int | None = None
     """Points of a cloud that the encoder sees and a step of training uses; None = all."""
 
@@ -120,9 +134,25 @@ def complete_config() -> ScapoConfig:
     )
 
 
+def warm_config() -> ScapoConfig:
+    """Lean, for partial views: the networks begin at what a run of `registered` says."""
+    lean = complete_config()
+    return replace(
+        lean,
+        preset="warm",
+        loss=replace(lean.loss, recon_form="partial"),
+        part_start="run",
+        search=replace(lean.search, teaching=800),
+        encoder_in_stage_2="end-to-end",
+        epochs=(30, 6),
+        lr=(2e-3, 3e-4),
+    )
+
+
 PRESETS: dict[str, Callable[[], ScapoConfig]] = {
     "paper": ScapoConfig,
     "literal": literal_config,
     "cpu": cpu_config,
     "complete": complete_config,
+    "warm": warm_config,
 }

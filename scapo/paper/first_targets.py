@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Stage 2's networks begin at what the search of parts found: regression before their losses.
+"""Stage 2's networks begin at parts and joints that are known: regression before their losses.
 
-Not in the paper. For some training clouds the search tells how the template lies in them; here that
-becomes what Theta_J, Theta_K and Theta_Delta should say of them, in the aligned frame of stage 1,
-and the networks are fitted to it. No label is involved.
+Not in the paper. For some training clouds the search of parts, or another run (`warm_start`), tells
+how the template lies in them; here that becomes what Theta_J, Theta_K and Theta_Delta should say of
+them, in the aligned frame of the encoder, and the networks are fitted to it. No label is involved.
 """
 
 from __future__ import annotations
@@ -49,37 +49,67 @@ def _rows(joints: JointPairs, index: Tensor) -> JointPairs:
     return JointPairs(pivot=joints.pivot[index], axis=joints.axis[index], state=joints.state[index])
 
 
-def first_targets(s: Skeleton, at: Placements, kinds: tuple[JointKind, ...]) -> FirstTargets:
-    """Targets from where the skeleton lies in each cloud.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lying:
+    """Each cloud's own shape with its joints at rest, template frame, and how it lies."""
+
+    points: Float[Tensor, "B M 3"]
+    keypoints: Float[Tensor, "B P 3"]
+    pivot: Float[Tensor, "B J 3"]
+    axis: Float[Tensor, "J 3"]
+    """Unit vectors, the same for all."""
+    turn: Float[Tensor, "B 3 3"]
+    """aligned_R_template, of the base."""
+    shift: Float[Tensor, "B 3"]
+    state: Float[Tensor, "B J"]
+
+
+def lying(s: Skeleton, at: Placements) -> Lying:
+    """A skeleton as it was placed: in three sizes, its parts where they sit on each body."""
+    size = at.size.exp()[:, None]
+    aside = F.pad(at.aside, (0, 0, 1, 0))  # (B, P, 3); the base's is 0
+    return Lying(
+        points=s.points * size + s.weights() @ aside,
+        keypoints=s.keypoints * size + aside,
+        pivot=s.pivot * size + at.aside,
+        axis=F.normalize(s.axis, dim=-1),
+        turn=rotvec_to_rotmat(at.turn),
+        shift=at.shift,
+        state=at.state,
+    )
+
+
+def first_targets(
+    template: Float[Tensor, "M 3"], own: Lying, kinds: tuple[JointKind, ...]
+) -> FirstTargets:
+    """Targets from where the template lies in each cloud.
 
     The base's turn about the joint's axis is its state; the rest of its pose is in axis and pivot.
     """
-    turn = rotvec_to_rotmat(at.turn)  # aligned_R_template (B, 3, 3)
-    size = at.size.exp()[:, None]
-    axis_y = F.normalize(s.axis, dim=-1).expand(len(turn), -1, -1)
-    pivot_y = s.pivot * size
+    turn = own.turn
+    axis_y = own.axis.expand(len(turn), -1, -1)
     axis_x = axis_y @ turn.mT
     twist = turn.mT[:, None] @ rotation_between(axis_x, axis_y).mT  # about axis_y (B, J, 3, 3)
     angle = (rotmat_to_rotvec(twist) * axis_y).sum(-1)
     hinge = torch.tensor([kind == "revolute" for kind in kinds])
     angle = torch.where(hinge, angle, 0.0)
-    keypoints = [s.keypoints[:1] * size]
+    keypoints = [own.keypoints[:, :1]]
     for j, kind in enumerate(kinds):
-        motion = joint_motion(pivot_y[:, j], axis_y[:, j], at.state[:, j], kind)
-        keypoints.append(apply(motion, s.keypoints[j + 1] * size))
-    place = torch.cat(keypoints, 1) @ turn.mT + at.shift[:, None]
+        motion = joint_motion(own.pivot[:, j], axis_y[:, j], own.state[:, j], kind)
+        keypoints.append(apply(motion, own.keypoints[:, j + 1, None]))
+    place = torch.cat(keypoints, 1) @ turn.mT + own.shift[:, None]
     return FirstTargets(
         joints=JointPairs(
-            pivot=pivot_y @ turn.mT + at.shift[:, None],
+            pivot=own.pivot @ turn.mT + own.shift[:, None],
             axis=axis_x,
-            state=torch.stack([-angle, at.state - angle], -1),
+            state=torch.stack([-angle, own.state - angle], -1),
         ),
         template_joints=JointPairs(
-            pivot=pivot_y,
+            pivot=own.pivot,
             axis=axis_y,
-            state=torch.zeros_like(at.state)[..., None].expand(-1, -1, 2),
+            state=torch.zeros_like(own.state)[..., None].expand(-1, -1, 2),
         ),
-        residual=s.points * (size - 1),
+        residual=own.points - template,
         keypoints=place,
     )
 

@@ -42,14 +42,17 @@ class JointConfig:
     """Sizes of Theta_J; defaults as OP-Align's point network without its segmentation head."""
 
     width: int = 256
+    """Channels of the residual blocks."""
     blocks: int = 5
+    """Residual blocks."""
     head: tuple[int, int] = (256, 128)
+    """Channels of the layers that find joints."""
     points: int | None = None
     """Points it looks at, evenly taken from the cloud's order; None = all."""
     revolute_range: float = 2.0944
     """Width of the interval of states, rad (120 degrees)."""
     prismatic_range: float = 1.0
-    """The same for prismatic joints, in normalised units."""
+    """Width of the interval of ways of prismatic joints, in normalised units."""
     base_fixed: bool = True
     """Hold the parent's state at 0: moving the base is the same as moving the object."""
 
@@ -140,7 +143,9 @@ class HeadConfig:
     """Sizes of Theta_K (as ShapeMaker's) and Theta_Delta."""
 
     keypoint: tuple[int, int, int] = (512, 512, 256)
+    """Channels of Theta_K's layers."""
     residual: tuple[int, int] = (256, 128)
+    """Channels of Theta_Delta's layers."""
 
 
 class KeypointNetwork(nn.Module):

@@ -15,6 +15,7 @@ What OP-Align's released evaluator asks of a network (`record_*`, docs/bring-you
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -24,13 +25,13 @@ from torch import Tensor
 from scapo.categories import Category, JointKind
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
-from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.paper import losses
 from scapo.paper.augment import random_pose
-from scapo.paper.autoencoder import Decoder, Encoder
+from scapo.paper.autoencoder import Decoder, Encoder, Encoding
 from scapo.paper.config import PRESETS, ScapoConfig
 from scapo.paper.figures import articulated_pictures, canonical_pictures
-from scapo.paper.first_targets import Inputs, first_targets, fit_networks
+from scapo.paper.first_targets import Inputs, Lying, first_targets, fit_networks, lying
 from scapo.paper.heads import (
     JointNetwork,
     KeypointNetwork,
@@ -40,11 +41,13 @@ from scapo.paper.heads import (
     thin,
 )
 from scapo.paper.objectives import Explanation, articulation, canonicalisation
-from scapo.paper.part_search import PartSearch, motionless
+from scapo.paper.part_search import PartSearch, Skeleton, motionless
 from scapo.paper.refine import refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
+from scapo.paper.warm_start import WarmStart, imitation, load_run
 from scapo.pictures import PictureData
+from scapo.records import cat, map_tensors, take
 from scapo.types import Joints, Labels, Observation, Prediction
 
 
@@ -65,7 +68,9 @@ def opalign_record(e: Explanation) -> dict[str, Tensor]:
     return record
 
 
-UNNAMED = frozenset({"preset", "supervision", "loss.without", "lr", "min_lr", "weight_decay"})
+UNNAMED = frozenset(
+    {"preset", "supervision", "loss.without", "lr", "min_lr", "weight_decay", "start"}
+)
 """Options with names of their own in a variant, or that make no other."""
 CANONICALISE = "canonicalise"
 ARTICULATE = "articulate"
@@ -101,6 +106,7 @@ class Scapo(AbstractMethod):
             self.template = Template(config.decoder.points, parts)
             self.bones = Bones(parts, config.gamma)
         initialise(self, generator)
+        self._run: WarmStart | None = None
 
     @property
     def variant(self) -> str:
@@ -128,6 +134,7 @@ class Scapo(AbstractMethod):
             for module, (rate, begin) in zip(modules, rates, strict=True)
         )
         first = (ParameterGroup(module="encoder"), ParameterGroup(module="decoder"))
+        told = config.told if config.part_start == "run" else None
         return tuple(
             Stage(
                 name=name,
@@ -136,12 +143,14 @@ class Scapo(AbstractMethod):
                 min_lr=config.min_lr,
                 weight_decay=config.weight_decay,
                 batch=config.batch,
+                clouds=clouds,
                 parameters=parameters,
             )
-            for name, epochs, lr, parameters in zip(
-                (CANONICALISE, ARTICULATE), epochs, config.lr, (first, groups), strict=True
+            for name, epochs, lr, clouds, parameters in zip(
+                (CANONICALISE, ARTICULATE), epochs, config.lr, (told, None), (first, groups),
+                strict=True,
             )
-        )
+        )  # fmt: skip
 
     @torch.no_grad()
     def start(
@@ -149,58 +158,88 @@ class Scapo(AbstractMethod):
     ) -> None:
         """Before stage 2: the decoded medoid of (at most 2,000) codes into the template, and parts.
 
-        With `part_start` search, template, bones, joints and the networks' first answers are then
-        those of the search.
+        With `part_start` search or run, template, bones, joints and the networks' first answers
+        are then those of the search or of the run.
+
+        Raises:
+            StoreError: No such run.
+            ValueError: None was named.
         """
         del labels
         config = self.config
+        if config.part_start == "run":
+            self._warm()
         if stage != ARTICULATE or config.template_start == "random":
             return
         number = observation.points.shape[0]
         chosen = torch.randperm(number, generator=generator, device=generator.device)[:2000]
+        if config.part_start == "run":
+            chosen = evenly(number, config.told).to(chosen)
         self.eval()
         clouds = normalise(observation.points[chosen])[0]
-        seen = [self.encoder(thin(some, config.points or number)) for some in clouds.split(64)]
-        code = torch.cat([encoding.code for encoding in seen])
-        medoid = torch.cdist(code, code).sum(1).argmin()
-        shape, _ = self.decoder(code[medoid, None])
-        keypoints = part_centroids(shape[0], len(self.category.parts))
-        self.template.set_to(shape[0], keypoints)
+        count = config.points or clouds.shape[1]
+        seen = cat([self.encoder(thin(some, count)) for some in clouds.split(64)])
+        medoid = int(torch.cdist(seen.code, seen.code).sum(1).argmin())
+        shape = self.decoder(seen.code[medoid, None])[0][0]
+        keypoints = part_centroids(shape, len(self.category.parts))
+        self.template.set_to(shape, keypoints)
         self.keypoint_network.start_at(keypoints)
         if config.part_start == "search":
-            aligned = [
-                encoding.align(some) for encoding, some in zip(seen, clouds.split(64), strict=True)
-            ]
-            self._start_parts(torch.cat(aligned), code, int(medoid), generator)
+            some = slice(config.search.taught)
+            skeleton, own = self._searched(seen.align(clouds), medoid)
+            self._teach(
+                skeleton, own, clouds[some], map_tensors(seen, lambda x: x[some]), generator
+            )
+        elif config.part_start == "run":
+            told = self._warm().read(take(observation, chosen), chosen, seen)
+            order = told.order(shape, medoid, self.kinds)
+            skeleton = told.skeleton(order, config.search.spread)
+            self._teach(skeleton, told.lying(order, seen), clouds, seen, generator)
 
-    def _start_parts(
-        self,
-        aligned: Float[Tensor, "B N 3"],
-        code: Float[Tensor, "B Z"],
-        medoid: int,
-        generator: torch.Generator,
-    ) -> None:
-        """Template, bones and networks as the search of parts leaves them."""
+    def _warm(self) -> WarmStart:
+        """The run that tells where the networks begin."""
+        if self._run is None:
+            if self.config.start is None:
+                raise ValueError(
+                    "start: expected the run folder of a trained `registered`, found none; "
+                    "`scapo-bench train registered --category C --data DIR --out RUN` makes one"
+                )
+            self._run = WarmStart(load_run(Path(self.config.start), self.category))
+        return self._run
+
+    def _searched(self, aligned: Float[Tensor, "B N 3"], medoid: int) -> tuple[Skeleton, Lying]:
+        """What the search of parts finds, and how it lies in the clouds to be learned."""
         config = self.config.search
         parts = PartSearch(self.kinds, config)
         found, _ = parts.search(aligned[medoid], aligned)
         skeleton = found.laid_over(self.template.points)
         some = aligned[: config.taught]
         at, _ = parts.place(some, found, motionless(some, len(self.kinds)), config.placing)
+        return skeleton, lying(skeleton, at)
+
+    def _teach(
+        self,
+        skeleton: Skeleton,
+        own: Lying,
+        clouds: Float[Tensor, "B N 3"],
+        seen: Encoding,
+        generator: torch.Generator,
+    ) -> None:
+        """Template, bones and networks as the skeleton lies in some clouds."""
         self.template.set_to(skeleton.points, skeleton.keypoints)
         self.bones.set_to(skeleton.precision())
-        features = [self.decoder(codes)[1] for codes in code[: config.taught].split(64)]
+        features = [self.decoder(codes)[1] for codes in seen.code.split(64)]
         fit_networks(
             (self.joint_network, self.keypoint_network, self.residual_network),
             Inputs(
                 template=skeleton.points,
-                aligned=some,
-                code=code[: config.taught],
+                aligned=seen.align(clouds),
+                code=seen.code,
                 features=torch.cat(features),
             ),
-            first_targets(skeleton, at, self.kinds),
+            first_targets(skeleton.points, own, self.kinds),
             generator,
-            config.teaching,
+            self.config.search.teaching,
         )
 
     def explain(self, points: Float[Tensor, "B N 3"]) -> Explanation:
@@ -238,6 +277,11 @@ class Scapo(AbstractMethod):
         pose = random_pose(points.shape[0], config.shift, step.generator, points)
         points = apply(pose, points)
         if step.stage == CANONICALISE:
+            if self.config.part_start == "run":
+                encoding = self.encoder(points)
+                told = self._warm().read(observation, step.index, encoding, pose)
+                shape, _ = self.decoder(encoding.code)
+                return imitation(encoding, shape, told, self.kinds, config)
             return canonicalisation(self.encoder, self.decoder, points, config, step.generator)
         self._freeze(step)
         explanation = self.explain(points)

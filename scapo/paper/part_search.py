@@ -19,7 +19,7 @@ from typing import Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
@@ -40,18 +40,23 @@ class SearchConfig:
     """Points of the template around which a part may be."""
     clouds: tuple[int, ...] = (16, 32, 64)
     """Clouds fitted in each round; as many others judge."""
+    alike: int = 4
+    """Times the clouds of the last round that are placed, for those most like the template."""
     kept: tuple[int, ...] = (6, 2)
     """Starts that go on from each round but the last."""
     steps: tuple[int, ...] = (40, 60, 150)
     """Steps of Adam in each round."""
     points: int = 512
-    """Of the template."""
+    """Points of the template."""
     asked: int = 256
     """Points of each cloud, and of the template, whose nearest is looked for in a step."""
     rate: float = 0.02
     """Learning rate of poses and states."""
     reach: float = 1.2
     """States that are tried lie within this many radians either side of 0."""
+    aside: float = 0.4
+    """Weight of the squared shift of a joint on the body, which lets hinges sit elsewhere on each
+    object: without it a far hinge, about which a part slides, tells how bodies differ."""
     spread: float = 0.03
     """Added to the deviations of a part's points where its bone begins."""
     taught: int = 1000
@@ -83,11 +88,16 @@ class Skeleton:
 
     def laid_over(self, shape: Float[Tensor, "K 3"]) -> Skeleton:
         """With as many points as a shape, each the nearest to one of it that is left."""
-        from scipy.optimize import linear_sum_assignment
+        return replace(self, points=self.points[matched(shape, self.points)])
 
-        cost = torch.cdist(shape, self.points).square()
-        _, column = linear_sum_assignment(cost.cpu().numpy())
-        return replace(self, points=self.points[torch.as_tensor(column)])
+
+def matched(shape: Float[Tensor, "K 3"], points: Float[Tensor, "M 3"]) -> Int[Tensor, " K"]:
+    """For each point of a shape one of the points, none twice, squared distances least in all."""
+    from scipy.optimize import linear_sum_assignment
+
+    cost = torch.cdist(shape, points).square()
+    _, column = linear_sum_assignment(cost.cpu().numpy())
+    return torch.as_tensor(column).to(points.device)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +109,8 @@ class Placements:
     shift: Float[Tensor, "B 3"]
     size: Float[Tensor, "B 3"]
     """Logarithms of the scales along the template's axes."""
+    aside: Float[Tensor, "B J 3"]
+    """Of a joint and its part on the base; template frame, after scaling."""
     state: Float[Tensor, "B J"]
 
 
@@ -115,7 +127,13 @@ def having(of: T, new: Iterable[Tensor]) -> T:
 def motionless(clouds: Float[Tensor, "B N 3"], joints: int) -> Placements:
     """Where everything begins."""
     zero = clouds.new_zeros(len(clouds), 3)
-    return Placements(turn=zero, shift=zero, size=zero, state=clouds.new_zeros(len(clouds), joints))
+    return Placements(
+        turn=zero,
+        shift=zero,
+        size=zero,
+        aside=clouds.new_zeros(len(clouds), joints, 3),
+        state=clouds.new_zeros(len(clouds), joints),
+    )
 
 
 def posed(s: Skeleton, at: Placements, kinds: Kinds) -> Float[Tensor, "B M 3"]:
@@ -129,6 +147,7 @@ def posed(s: Skeleton, at: Placements, kinds: Kinds) -> Float[Tensor, "B M 3"]:
     ]
     weights = s.weights().expand(len(size), -1, -1)
     moved = deform(torch.stack([eye, *moves], 1), points, weights)
+    moved = moved + weights[..., 1:] @ at.aside
     return moved @ rotvec_to_rotmat(at.turn).mT + at.shift[:, None]
 
 
@@ -144,6 +163,23 @@ def misfit(
     there = (some - gather(shapes, nearest(some, shapes))).square().sum(-1)
     back = (others - gather(clouds, nearest(others, clouds))).square().sum(-1)
     return (there + 1e-6).sqrt().mean(-1) + (back + 1e-6).sqrt().mean(-1)
+
+
+@torch.no_grad()
+def unlikeness(
+    clouds: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"], asked: int
+) -> Float[Tensor, " B"]:
+    """Mean distance to the nearest point, both ways, of the points that are not far: `NEAR`."""
+    some, others = _every(clouds, asked, 0), _every(shapes, asked, 0)
+    gaps = []
+    for here, there in ((some, shapes), (others, clouds)):
+        gap = (here - gather(there, nearest(here, there))).norm(dim=-1)
+        gaps.append(gap.sort(-1).values[:, : int(NEAR * gap.shape[1])].mean(-1))
+    return gaps[0] + gaps[1]
+
+
+NEAR = 0.75
+"""Share of the points that tell whether two objects are alike; the others may have moved."""
 
 
 def _every(points: Float[Tensor, "B N 3"], count: int, offset: int) -> Float[Tensor, "B K 3"]:
@@ -263,15 +299,17 @@ class PartSearch:
 
         Args:
             template: A shape of the category in the aligned frame.
-            clouds: Aligned; the first half is fitted, the second judges.
+            clouds: Aligned; of the first half those are fitted that are most like the template, of
+                the second they judge. What two clouds of like objects differ by is what moved.
 
         Returns:
             It, and of each round the misfit of every start, rising.
         """
         c = self.config
-        sides = [half[: c.clouds[-1]] for half in clouds.chunk(2)]
         number = torch.arange(c.points, device=template.device) * len(template) // c.points
-        starts, at = self.starts(template[number], sides)
+        whole = self.in_one_piece(template[number])
+        sides, at = zip(*(self.most_alike(half, whole) for half in clouds.chunk(2)), strict=True)
+        starts = self.starts(whole.points, sides[0], at[0])
         said = []
         for count, steps, kept in zip(c.clouds, c.steps, (*c.kept, 1), strict=True):
             fitted, judged = (having(where, [x[:count] for x in values(where)]) for where in at)
@@ -286,20 +324,37 @@ class PartSearch:
             starts = [ends[k] for k in order[:kept]]
         return starts[0], said
 
-    def starts(
-        self, points: Float[Tensor, "M 3"], sides: list[Float[Tensor, "B N 3"]]
-    ) -> tuple[list[Skeleton], list[Placements]]:
-        """Skeletons of all splits, and the placements of the template as one rigid body."""
+    def in_one_piece(self, points: Float[Tensor, "M 3"]) -> Skeleton:
+        """A template that is to be placed as a rigid body: its parts are any."""
+        some = points[:, 0] > points[:, 0].mean()
+        return split_skeleton(points, [some] * len(self.kinds), self.config.spread)
+
+    def most_alike(
+        self, clouds: Float[Tensor, "B N 3"], whole: Skeleton
+    ) -> tuple[Float[Tensor, "K N 3"], Placements]:
+        """The clouds that a rigid template fits best but for what moved, the best first; how."""
         c, joints = self.config, len(self.kinds)
-        any_child = points[:, 0] > points[:, 0].mean()
-        whole = split_skeleton(points, [any_child] * joints, c.spread)
-        at = [
-            self.descend(side, whole, motionless(side, joints), c.placing, "rigid")[1]
-            for side in sides
-        ]
-        stray = residual(sides[0], posed(whole, at[0], self.kinds), points)
+        still = whole.points.expand(len(clouds), -1, -1)
+        some = clouds[unlikeness(clouds, still, c.asked // 2).argsort()[: c.alike * c.clouds[-1]]]
+        _, at = self.descend(some, whole, motionless(some, joints), c.placing, "rigid")
+        order = unlikeness(some, posed(whole, at, self.kinds), c.asked).argsort()[: c.clouds[-1]]
+        return some[order], having(at, [value[order] for value in values(at)])
+
+    def starts(
+        self, points: Float[Tensor, "M 3"], clouds: Float[Tensor, "B N 3"], at: Placements
+    ) -> list[Skeleton]:
+        """Skeletons of all splits.
+
+        Args:
+            points: Of the template.
+            clouds: Those most like it, the most first.
+            at: Its placements in them as one rigid body.
+        """
+        c, joints, few = self.config, len(self.kinds), self.config.clouds[0]
+        shapes = posed(self.in_one_piece(points), at, self.kinds)
+        stray = residual(clouds[:few], shapes[:few], points)
         some = splits(points, stray, joints, c.seeds)
-        return [split_skeleton(points, children, c.spread) for children in some], at
+        return [split_skeleton(points, children, c.spread) for children in some]
 
     @torch.enable_grad()
     def descend(
@@ -323,7 +378,7 @@ class PartSearch:
         at = self.with_best_states(clouds, s, at) if moves else at
         own = [value.clone().requires_grad_() for value in values(at)]
         common = [value.clone().requires_grad_(shared) for value in values(s)]
-        learning = own[: None if moves else -1] + common * shared
+        learning = own[: None if moves else -2] + common * shared
         rates = [c.rate] * (len(learning) - len(RATES) * shared) + [
             c.rate * rate for rate in RATES
         ] * shared
@@ -337,6 +392,7 @@ class PartSearch:
                 group["lr"] = rate * 0.1 ** (k / steps)
             cost = misfit(clouds, posed(s, at, self.kinds), c.asked, k).mean()
             cost = cost + 0.05 * at.size.square().mean() + (held(s, at) if shared else 0.0)
+            cost = cost + c.aside * at.aside.square().sum(-1).mean()
             optimizer.zero_grad()
             cost.backward()
             optimizer.step()

@@ -104,7 +104,7 @@ class SearchConfig:
     """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
     and were placed in training, half as of images of the template; 0: the network's four."""
     quick_hypotheses: int = 12
-    """The same for `quick`."""
+    """Placements of each cloud that `quick` begins with."""
     strays: Literal["out", "kept"] = "out"
     """Whether outliers, points that do not belong to the object, are left out."""
     settle: bool = True

@@ -47,7 +47,9 @@ class FitConfig:
     """How a run is driven; nothing here is a property of the method."""
 
     seed: int = 1
+    """Seed of the first weights, the order of the data and the augmentation."""
     device: str = "cpu"
+    """Where the networks run: cpu, cuda, cuda:1, ..."""
     log_every: int = 10
     """Steps between two lines of metrics.jsonl, which hold means over them."""
     checkpoint_every: float = 60.0

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +27,7 @@ from tests.helpers.strategies import generator
 from tests.helpers.tiny import tiny_data
 
 NEEDS = {"kiss-matcher": "kiss_matcher"}
-"""Packages of methods that no extra for the bench installs."""
+"""Packages of methods that have an extra of their own."""
 ALL = tuple(
     pytest.param(
         name,
@@ -127,7 +128,11 @@ def test_from_training_to_a_table(name: str, data: Path, runs: Path, tmp_path: P
     (scores,) = read_scores(tmp_path / "scores" / f"laptop-{name}.csv.gz")
     assert scores.run.method == name
     table = (tmp_path / "tables" / "table1.md").read_text()
-    assert METHODS[name].title in table
+    title = re.escape(METHODS[name].title)
+    told = rf"- {title}.*, laptop on .*, 5 samples; .*; device cpu, processor .+, batch \d+, "
+    assert re.search(told + r"seconds per cloud \d[\d.e-]*; budget: ", table)
+    (line, *_) = re.findall(rf"^\|.*\| {title}[^|]*\| ours .*$", table, re.MULTILINE)
+    assert line.split("|")[7].strip() == ("✓" if METHODS[name].camera else "")
 
 
 @pytest.mark.parametrize("name", ALL)

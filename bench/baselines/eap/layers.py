@@ -30,9 +30,11 @@ class EncoderConfig:
     """Sizes of an EPN encoder, which keeps all points."""
 
     channels: tuple[int, ...] = (64, 128, 512)
+    """Channels of each block."""
     radii: tuple[float, ...] = (0.08, 0.16, 0.226)
     """0.2 x 0.4 x (1, 2, 2.83) where the box's diagonal is 1; mean radius 0.25 is about that."""
     neighbours: int = 64
+    """Most points of a neighbourhood."""
     recompute: bool = False
     """Compute correlations twice rather than keep them: less memory, more time."""
 

@@ -49,8 +49,11 @@ class LossConfig:
     """Weights of stage 1's terms; stage 0 has one."""
 
     whole: float = 1.0
+    """Weight of the distance between the cloud and its whole reconstruction."""
     slots: float = 0.5
+    """Weight of the distances of the slots' shapes."""
     pivot: float = 1.0
+    """Weight of the pivots' distance to both parts."""
     shifts: int = 10
     """How many shifts of the pivot along the axis a step draws."""
     joint_length: float = 0.3
@@ -66,20 +69,28 @@ class EapConfig:
     points: int = 512
     """Points that the networks look at, evenly taken from the cloud's order."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """Sizes of both encoders."""
     whole: WholeConfig = field(default_factory=WholeConfig)
+    """Sizes of stage 0."""
     parts: PartConfig = field(default_factory=PartConfig)
+    """Sizes of stage 1."""
     loss: LossConfig = field(default_factory=LossConfig)
+    """Weights of stage 1's terms."""
     mode: Literal["usual", "each"] = "usual"
     """Anchor of the parts at test time: the one that most training clouds choose (published: one
     picked by hand for each category), or each cloud's own."""
     epochs: tuple[int, int] = (32, 32)
-    """Of both stages: where there are 5,000 clouds the learning rate has then reached its least."""
+    """Epochs of both stages: with 5,000 clouds the learning rate has then reached its least."""
     lr: float = 1e-4
+    """Learning rate at the start."""
     min_lr: float = 1e-7
+    """Least learning rate."""
     decay: float = 0.64
-    """Of the learning rate every 2 epochs: 0.7 every 1,000 steps of 8 clouds of 5,000."""
+    """Factor of the learning rate every 2 epochs: 0.7 every 1,000 steps of 8 clouds of 5,000."""
     weight_decay: float = 1e-8
+    """Added to the gradient, times the weights."""
     batch: int = 8
+    """Clouds a step."""
 
 
 def cpu_config() -> EapConfig:

@@ -36,17 +36,17 @@ class PartConfig:
     """Sizes of stage 1."""
 
     width: int = 256
-    """Of codes, slots and the layers after the encoders."""
+    """Channels of codes, slots and the layers after the encoders."""
     points: int = 128
-    """Of the shape of each slot."""
+    """Points of the shape of each slot."""
     rounds: int = 7
-    """Of the slot attention."""
+    """Rounds of the slot attention."""
     passes: int = 2
     """Passes over the cloud; each after the first undoes the motions that the last one found."""
     angle_range: float = 0.5 * math.pi
     """Largest angle of a slot, rad."""
     slide_range: float = 0.5
-    """The same for prismatic joints, in normalised units."""
+    """Largest way of a slot of a prismatic joint, in normalised units."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

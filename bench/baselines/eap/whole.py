@@ -22,9 +22,9 @@ class WholeConfig:
     """Sizes of stage 0."""
 
     width: int = 256
-    """Of the code and of the layers after the encoder."""
+    """Channels of the code and of the layers after the encoder."""
     points: int = 512
-    """Of the reconstructed shape."""
+    """Points of the reconstructed shape."""
     chosen_by: int | None = None
     """Points of the cloud that choose the anchor; None = all."""
 

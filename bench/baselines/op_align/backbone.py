@@ -24,13 +24,14 @@ class BackboneConfig:
     """Sizes of the equivariant backbone; defaults as published."""
 
     channels: tuple[int, ...] = (32, 64, 128, 256)
-    """Of each group; every group keeps one point of two."""
+    """Channels of each group; every group keeps one point of two."""
     depth: tuple[int, ...] = (2, 2, 2, 1)
     """Convolutions of each group."""
     radius: float = 0.2
-    """Of the first convolution's neighbourhoods; times the square root of 2 with every halving."""
+    """Radius of the first convolution's neighbourhoods; times the square root of 2 with every
+    halving."""
     neighbours: int = 32
-    """Of the first convolution of a group, half as many of the others."""
+    """Most neighbours of the first convolution of a group, half as many of the others."""
     points: int | None = None
     """Points it looks at, evenly taken from the cloud's order; None = all."""
     sampling: Sampling = "farthest"

@@ -44,7 +44,7 @@ class HypothesisConfig:
     width: int = 512
     """Channels per rotation."""
     hidden: int = 128
-    """Of the attention and of the residual pose."""
+    """Channels of the attention and of the residual pose."""
     code: int = 256
     """Numbers of the invariant shape code."""
 
@@ -100,8 +100,9 @@ class DecoderConfig:
     """Sizes of the decoder."""
 
     width: int = 256
+    """Channels of the decoder's layers."""
     points: int = 1024
-    """Of the canonical shape."""
+    """Points of the canonical shape."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -146,13 +147,17 @@ class PointNetConfig:
     """Sizes of the network that segments and finds joints."""
 
     width: int = 256
+    """Channels of the residual blocks."""
     blocks: int = 5
+    """Residual blocks."""
     segmentation: tuple[int, ...] = (128, 32)
+    """Channels of the layers that segment."""
     joint: tuple[int, int] = (256, 128)
+    """Channels of the layers that find joints."""
     revolute_range: float = 2.0944
     """Width of the interval of states, rad (120 degrees)."""
     prismatic_range: float = 2.0944
-    """The same for prismatic joints, in normalised units: the published code has one number."""
+    """Width of the interval of ways, normalised units: the published code has one number."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for more blocks than any network has, as damaged files ask for."""

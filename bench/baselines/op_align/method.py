@@ -52,26 +52,31 @@ class LossConfig:
     """Weights of the terms; defaults as published."""
 
     reconstruction: float = 10.0
-    """Of L_rigid and L_art, which share it."""
+    """Weight of L_rigid and L_art, which share it."""
     rigid_share: float = 0.5
-    """Of L_rigid at the beginning, the rest is L_art's; halved with the learning rate."""
+    """Share of L_rigid at the beginning, the rest is L_art's; halved with the learning rate."""
     density: float = 200.0
+    """Weight of how unevenly the canonical points lie: the variance of neighbour distances."""
     density_neighbours: int = 64
+    """Neighbours of a point that tell how densely it lies."""
     offset: float = 10.0
-    """The decoder's offsets from the base shape."""
+    """Weight of the decoder's offsets from the base shape."""
     centroid: float = 1.0
+    """Weight of the squared distance of the shape's centroid from the origin."""
     gauge: float = 10.0
-    """States of the canonical shape near 0, its axes the same for all clouds."""
+    """Weight of states of the canonical shape near 0, its axes the same for all clouds."""
     pivot: float = 0.1
-    """Pivots near points, of either shape."""
+    """Weight of pivots near points, of either shape."""
     same_turn: float = 1.0
-    """For three parts."""
+    """With three parts: weight of the turns between the axes of both shapes being alike."""
     same_base: float = 10.0
-    """For three parts."""
+    """With three parts: weight of the base being mapped alike by either joint."""
     attention: float = 1.0
+    """Weight of the expected distance under the attention."""
     translation: float = 1.0
-    """The chosen hypothesis's squared translation."""
+    """Weight of the chosen hypothesis's squared translation."""
     part_share: float = 10.0
+    """Weight of parts that are empty and of points that belong to one part alone."""
     labelled_segmentation: float = 1.0
     """Used with `supervision` segmentation only."""
     labelled_joints: float = 1.0
@@ -85,16 +90,22 @@ class OpAlignConfig:
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    """Sizes of the equivariant backbone."""
     hypotheses: HypothesisConfig = field(default_factory=HypothesisConfig)
+    """Sizes of the pose head."""
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    """Sizes of the decoder."""
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
+    """Sizes of the network that segments and finds joints."""
     loss: LossConfig = field(default_factory=LossConfig)
+    """Weights of the loss terms."""
     supervision: tuple[Literal["segmentation", "joint"], ...] = ()
     """Labels that training may see: both in Table 2, OP-Align (SJ)."""
     color: bool = True
     """Show the network the colours that the data have; else, and without any, all is grey."""
     color_weight: float = 0.0
-    """Of colours in distances; the decoder then has a colour branch. 0 in the published runs."""
+    """Weight of colours in distances; the decoder then has a colour branch. 0 in the published
+    runs."""
     points: int | None = None
     """Points of every cloud that a training step draws anew; None = all."""
     chosen_by: int | None = None
@@ -102,19 +113,23 @@ class OpAlignConfig:
     direction_noise: float = 0.01
     """Width of the uniform noise on axes in training."""
     test_noise: bool = False
-    """The same noise at test time, as published."""
+    """Noise on axes at test time too, as published."""
     turned: float = 0.0
     """Share of the training clouds that are turned at random (published: real data, 0.5)."""
     noise: float = 0.0
-    """Of coordinates in training, normalised units (published: real data, 1e-3 on half)."""
+    """Noise of coordinates in training, normalised units (published: real data, 1e-3 on half)."""
     epochs: int = 64
     """20,000 steps of 16 clouds where there are 5,000."""
     decay_every: int = 16
     """Epochs after which the learning rate and `loss.rigid_share` are halved (5,000 steps)."""
     lr: float = 1e-4
+    """Learning rate at the start."""
     min_lr: float = 1e-6
+    """Least learning rate."""
     weight_decay: float = 1e-8
+    """Added to the gradient, times the weights."""
     batch: int = 16
+    """Clouds a step."""
 
 
 def cpu_config() -> OpAlignConfig:

@@ -41,6 +41,21 @@ def test_the_grid_has_every_method_of_every_table(cpu: Plan):
     assert cpu.configs["scapo-sj"]["config"]["supervision"] == ["segmentation", "joint"]
 
 
+def test_a_warm_start_has_a_run_of_its_own_to_begin_at(cpu: Plan):
+    chain = next(c for c in cpu.chains if c.label == "scapo-warm" and c.part == "clean")
+    first, second = chain.steps[:2]
+    assert first.command[:2] == ("train", "registered")
+    assert second.command[:2] == ("train", "scapo")
+    out = first.command[first.command.index("--out") + 1]
+    assert second.command[second.command.index("--start") + 1] == out
+    assert first.output == out.removeprefix("{out}/") + "/checkpoint.safetensors"
+    assert second.needs == ("start",)
+    config = cpu.configs["scapo-warm"]
+    assert config["config"]["part_start"] == "run"
+    assert config["start"]["method"] == "registered"
+    assert cpu.seconds[chain.name, "start"] == 1200
+
+
 def test_every_output_is_made_once_and_every_need_is_met_before(cpu: Plan):
     outputs = Counter(step.output for chain in cpu.chains for step in chain.steps)
     assert max(outputs.values()) == 1

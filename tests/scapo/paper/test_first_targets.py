@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES, JointKind
 from scapo.geometry.rotations import rotvec_to_rotmat
-from scapo.paper.first_targets import Inputs, first_targets, fit_networks
+from scapo.paper.first_targets import Inputs, first_targets, fit_networks, lying
 from scapo.paper.heads import JointNetwork, KeypointNetwork, ResidualNetwork
 from scapo.paper.part_search import Placements, Skeleton, T, having, posed, values
 from scapo.paper.skinning import Bones, cross_maps, deform, part_maps
@@ -36,6 +36,7 @@ def placements(joints: int, clouds: int = 5) -> Placements:
         turn=0.4 * normal(3, clouds, 3),
         shift=0.1 * normal(4, clouds, 3),
         size=0.1 * normal(5, clouds, 3),
+        aside=0.1 * normal(9, clouds, joints, 3),
         state=normal(6, clouds, joints),
     )
 
@@ -49,7 +50,7 @@ def single(of: T) -> T:
 def test_the_cross_maps_of_the_targets_are_the_placements(joints: int) -> None:
     s, at = skeleton(joints), placements(joints)
     kinds: tuple[JointKind, ...] = ("revolute",) * joints
-    wanted = first_targets(s, at, kinds)
+    wanted = first_targets(s.points, lying(s, at), kinds)
     maps = part_maps(cross_maps(wanted.template_joints, wanted.joints, kinds))
     template = s.points + wanted.residual
     weights = s.weights().expand(len(template), -1, -1)
@@ -60,7 +61,7 @@ def test_the_cross_maps_of_the_targets_are_the_placements(joints: int) -> None:
 
 def test_a_slide_keeps_its_way_and_the_axis_turns_along() -> None:
     s, at = skeleton(1), placements(1)
-    wanted = first_targets(s, at, ("prismatic",))
+    wanted = first_targets(s.points, lying(s, at), ("prismatic",))
     assert_close(wanted.joints.relative(), at.state, atol=1e-9, rtol=0)
     axis = torch.nn.functional.normalize(s.axis, dim=-1) @ rotvec_to_rotmat(at.turn).mT
     assert_close(wanted.joints.axis, axis, atol=1e-9, rtol=0)
@@ -88,7 +89,7 @@ def test_bones_turn_with_their_parts() -> None:
 def test_networks_learn_the_targets() -> None:
     s = single(skeleton(1))
     at = single(placements(1, 8))
-    wanted = first_targets(s, at, ("revolute",))
+    wanted = first_targets(s.points, lying(s, at), ("revolute",))
     networks = (
         JointNetwork(TINY.joint, CATEGORIES["laptop"]),
         KeypointNetwork(TINY.heads, 6, 2),

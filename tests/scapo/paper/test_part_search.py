@@ -72,13 +72,15 @@ def test_a_skeleton_lies_as_its_placement_says() -> None:
     )
     turn, shift = torch.tensor([[0.1, 0.2, 0.3]]).double(), torch.tensor([[1.0, 2, 3]]).double()
     size = torch.tensor([[0.1, 0.0, -0.1]]).double()
-    at = Placements(turn=turn, shift=shift, size=size, state=torch.tensor([[0.7]]).double())
+    aside = torch.tensor([[[0.05, -0.1, 0.2]]]).double()
+    state = torch.tensor([[0.7]]).double()
+    at = Placements(turn=turn, shift=shift, size=size, aside=aside, state=state)
     sized = points * size.exp()
     motion = joint_motion(
         skeleton.pivot[0] * size.exp()[0], torch.tensor([0.0, 0, 1]).double(),
         torch.tensor(0.7).double(), "revolute",
     )  # fmt: skip
-    sized[20:] = apply(motion, sized[20:])
+    sized[20:] = apply(motion, sized[20:]) + aside[0]
     expected = apply(rigid(rotvec_to_rotmat(turn), shift), sized[None])
     assert_close(posed(skeleton, at, ("revolute",)), expected, atol=1e-6, rtol=0)
     assert misfit(expected, expected, 40).item() == pytest.approx(2e-3)
@@ -111,6 +113,25 @@ def test_a_skeleton_is_laid_over_a_shape_point_by_point() -> None:
     whole = split_skeleton(clouds[0], [part[0] == 1], CONFIG.spread)
     shape = whole.points[torch.randperm(200, generator=generator(3))[:60]] + 1e-4
     assert_close(whole.laid_over(shape).points, shape, atol=1e-3, rtol=0)
+
+
+def test_clouds_of_like_objects_come_first_whatever_their_states() -> None:
+    flat = 0.8 * torch.rand(6, 200, 2, generator=generator(7)) - 0.4
+    points = torch.cat([flat, torch.zeros(6, 200, 1)], -1)
+    points[::2] *= torch.tensor([0.6, 1.5, 1.0])  # other objects
+    flap = points[..., 1] > 0.25 * points[..., 1].amax(1, keepdim=True) / 0.4
+    axis, pivot = torch.tensor([1.0, 0, 0]).expand(6, 3), torch.zeros(6, 3)
+    pivot[:, 1] = 0.25
+    states = torch.tensor([0.9, 0.1, 0.9, 0.9, 0.9, 1.7])
+    moved = apply(joint_motion(pivot, axis, states, "revolute"), points)
+    clouds = torch.where(flap[..., None], moved, points)
+    some = replace(CONFIG, clouds=(3, 5), placing=5, points=100)
+    search_of = PartSearch(("revolute",), some)
+    found, at = search_of.most_alike(clouds, search_of.in_one_piece(clouds[3]))
+    assert found.shape[0] == at.state.shape[0] == 5
+    like = {tuple(cloud[0].tolist()) for cloud in clouds[1::2]}
+    assert {tuple(cloud[0].tolist()) for cloud in found[:3]} == like
+    assert torch.equal(at.state, torch.zeros(5, 1))
 
 
 def test_every_round_says_what_its_starts_left() -> None:

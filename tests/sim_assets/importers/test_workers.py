@@ -74,7 +74,7 @@ def test_a_worker_that_is_killed_or_stopped_changes_nothing(tmp_path: Path):
         (tmp_path / f"{number}.txt").write_text(f"file {number}")
     whole, refused = made(tmp_path / "whole", tmp_path, 0)
     assert refused == {}
-    (tmp_path / "1.left").write_text("SIGKILL SIGKILL")
+    (tmp_path / "1.left").write_text("SIGKILL")
     (tmp_path / "3.left").write_text("SIGSTOP")
     struck, refused = made(tmp_path / "struck", tmp_path, 1)
     assert refused == {}

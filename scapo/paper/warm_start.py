@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: MIT
+"""The networks begin at what a trained run of `registered` says of the training clouds.
+
+Not in the paper, whose stage 1 does not canonicalise partial views. Frames, shapes, joints and
+states are read off that run's predictions, which saw no label either: in place of stage 1 the
+encoder learns the frames and the decoder the whole shapes, and stage 2 begins at networks that were
+fitted to the joints and states (`first_targets`). Its losses are the paper's.
+
+Frame `base`: that of the base part, the aligned frame of a network that errs nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from scapo.categories import Category
+from scapo.geometry.points import chamfer, normalise
+from scapo.geometry.rigid import apply, invert, joint_motion, rigid
+from scapo.method import AbstractMethod, Mode
+from scapo.paper import losses
+from scapo.paper.autoencoder import Encoding
+from scapo.paper.first_targets import Lying
+from scapo.paper.objectives import LossConfig
+from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
+from scapo.records import cat, map_tensors, take
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.store.checkpoint import (
+    check_header,
+    config_from,
+    header_category,
+    load_arrays,
+    read_checkpoint,
+)
+from scapo.store.schema import StoreError
+from scapo.types import Observation
+
+POINTS = 1024
+"""Of a shape that are learned from: the first, which `registered` leaves spread out."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What the run says of clouds, in normalised units."""
+
+    rotation: Float[Tensor, "B 3 3"]
+    """input_R_base."""
+    translation: Float[Tensor, "B 3"]
+    shape: Float[Tensor, "B M 3"]
+    """Base frame, all states 0; the same points in the same order for every cloud."""
+    part: Int[Tensor, "B M"]
+    pivot: Float[Tensor, "B J 3"]
+    """Base frame, as the axis."""
+    axis: Float[Tensor, "B J 3"]
+    state: Float[Tensor, "B J"]
+
+    def observed(self, kinds: Kinds) -> Float[Tensor, "B M 3"]:
+        """The shape with its joints in their states, base frame."""
+        shape = self.shape
+        for j, kind in enumerate(kinds):
+            motion = joint_motion(self.pivot[:, j], self.axis[:, j], self.state[:, j], kind)
+            moved = apply(motion, self.shape)
+            shape = torch.where((self.part == j + 1)[..., None], moved, shape)
+        return shape
+
+    def exchanged(self, exchange: Exchange) -> Told:
+        """The same surfaces in the same places, told as if base and child were each other.
+
+        The new base is the old child seen through the half turn about the cloud's own pivot, which
+        reverses the axis; so the motion of the old base against the old child has the old state.
+        """
+        turn, pivot, state = exchange.turn, self.pivot[:, 0], self.state[:, 0]
+        motion = joint_motion(pivot, self.axis[:, 0], state, "revolute")
+        child = rigid(self.rotation, self.translation) @ motion
+        pose = child @ rigid(turn.expand_as(self.rotation), pivot - pivot @ turn.mT)
+        back = (self.shape[:, exchange.order] - self.pivot) @ turn + self.pivot
+        return replace(self, rotation=pose[:, :3, :3], translation=pose[:, :3, 3], shape=back)
+
+    def nearer(self, other: Told, encoding: Encoding) -> Told:
+        """Of two readings of each cloud the one whose frame is nearer to the encoder's."""
+        gap = [frame_errors(encoding, told) for told in (self, other)]
+        chosen = (gap[1] < gap[0]).long() * len(gap[0])
+        return take(cat([self, other]), chosen + torch.arange(len(gap[0])).to(chosen))
+
+    def turned(self, pose: Float[Tensor, "B 4 4"]) -> Told:
+        """Of the same clouds moved by a pose."""
+        moved = apply(pose, self.translation[:, None])[:, 0]
+        return replace(self, rotation=pose[:, :3, :3] @ self.rotation, translation=moved)
+
+    def order(self, shape: Float[Tensor, "K 3"], cloud: int, kinds: Kinds) -> Int[Tensor, " K"]:
+        """Points that are as many and lie as those of a shape, spread over all parts.
+
+        Args:
+            shape: What a decoder says of one of the clouds.
+            cloud: Which.
+            kinds: Of the joints.
+        """
+        number, count = self.shape.shape[1], len(shape)
+        some = torch.arange(count, device=shape.device)
+        some = some * number // count if count <= number else some % number
+        return some[matched(shape, self.observed(kinds)[cloud, some])]
+
+    def skeleton(self, order: Int[Tensor, " K"], spread: float) -> Skeleton:
+        """What the clouds share, of the points that are named, with bones as their parts are."""
+        points, part = self.shape[:, order].mean(0), self.part[0, order]
+        children = [part == j + 1 for j in range(self.state.shape[1])]
+        return replace(
+            split_skeleton(points, children, spread),
+            pivot=self.pivot.mean(0),
+            axis=F.normalize(self.axis.mean(0), dim=-1),
+        )
+
+    def lying(self, order: Int[Tensor, " K"], encoding: Encoding) -> Lying:
+        """The shapes of the points that are named, and how they lie in the encoder's frames."""
+        shape = self.shape[:, order]
+        member = F.one_hot(self.part[:, order], self.state.shape[1] + 1).to(shape)
+        back = encoding.rotation.mT
+        away = self.translation - encoding.translation
+        return Lying(
+            points=shape,
+            keypoints=member.mT @ shape / member.sum(1).clamp_min(1)[..., None],
+            pivot=self.pivot,
+            axis=F.normalize(self.axis.mean(0), dim=-1),
+            turn=back @ self.rotation,
+            shift=(back @ away[..., None])[..., 0],
+            state=self.state,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exchange:
+    """How base and child of a hinge may change places, as the two plates of a laptop."""
+
+    turn: Float[Tensor, "3 3"]
+    """Half a turn about an axis across the hinge, base frame with the states 0."""
+    order: Int[Tensor, " M"]
+    """For each point of a shape, which of the other part comes to lie nearest to it."""
+
+    @staticmethod
+    def of(told: Told) -> Exchange:
+        """The half turn that lays the parts of the mean shape upon each other best."""
+        shape, pivot = told.shape.mean(0), told.pivot.mean((0, 1))
+        axis = F.normalize(told.axis.mean((0, 1)), dim=0)
+        first = F.normalize(shape[told.part[0] == 1].mean(0) - pivot, dim=0)
+        first = F.normalize(first - (first @ axis) * axis, dim=0)
+        angle = torch.arange(0, torch.pi, torch.pi / HALF_TURNS).to(shape)[:, None]
+        across = angle.cos() * first + angle.sin() * torch.linalg.cross(axis, first)
+        turns = 2 * across[:, :, None] * across[:, None] - torch.eye(3).to(shape)
+
+        def gap(turn: Tensor, some: slice) -> Float[Tensor, "M M"]:
+            laid = (shape - pivot) @ turn.mT + pivot
+            part = told.part[0, some]
+            return torch.cdist(shape[some], laid[some]) + APART * (part[:, None] == part)
+
+        thin = slice(None, None, 4)
+        costs = [gap(turn, thin).amin(1).mean() + gap(turn, thin).amin(0).mean() for turn in turns]
+        best = turns[int(torch.stack(costs).argmin())]
+        return Exchange(turn=best, order=gap(best, slice(None)).argmin(1))
+
+
+HALF_TURNS = 120
+"""Axes that are tried."""
+APART = 10.0
+"""Length that is added between points of which none is to be laid upon the other."""
+
+
+def frame_errors(encoding: Encoding, told: Told) -> Float[Tensor, " B"]:
+    """What `pose_agreement` is a mean of."""
+    cosine = F.cosine_similarity(encoding.rotation, told.rotation, dim=-2)
+    return (1 - cosine).mean(1) + (encoding.translation - told.translation).square().mean(1)
+
+
+class WarmStart:
+    """A trained method that is asked for each training cloud once, where it is first needed.
+
+    Where a symmetry of the category exchanges the two parts, the method cannot tell which is which
+    (nor does the evaluation ask): each cloud then has two readings, and of these the one nearer to
+    what the encoder says is learned.
+    """
+
+    def __init__(self, method: AbstractMethod, mode: Mode = "quick") -> None:
+        """A method whose predictions have canonical points with parts, in one order for all."""
+        self.method = method
+        self.mode: Mode = mode
+        self.known: dict[int, Told] = {}
+        kinds = [joint.kind for joint in method.category.joints]
+        self.two_readings = method.category.symmetry is not None and kinds == ["revolute"]
+        self.exchange: Exchange | None = None
+
+    def read(
+        self,
+        observation: Observation,
+        index: Int[Tensor, " B"],
+        encoding: Encoding,
+        pose: Float[Tensor, "B 4 4"] | None = None,
+    ) -> Told:
+        """What it says of clouds, in the reading that is nearer to their encoding.
+
+        Args:
+            observation: The clouds, as the training has them.
+            index: Their rows among all training clouds.
+            encoding: What the encoder says of them.
+            pose: How they were moved before that; None: not at all.
+        """
+        told = self.of(observation, index)
+        if self.two_readings and self.exchange is None:
+            self.exchange = Exchange.of(told)
+        moved = told if pose is None else told.turned(pose)
+        return (
+            moved
+            if self.exchange is None
+            else moved.nearer(moved.exchanged(self.exchange), encoding)
+        )
+
+    def of(self, observation: Observation, index: Int[Tensor, " B"]) -> Told:
+        """What it says of clouds.
+
+        Args:
+            observation: The clouds, as the training has them.
+            index: Their rows among all training clouds, by which they are known again.
+        """
+        rows: Sequence[int] = index.tolist()
+        new = [k for k, row in enumerate(rows) if row not in self.known]
+        if new:
+            some = map_tensors(take(observation, torch.tensor(new).to(index)), Tensor.cpu)
+            found = self._ask(some)
+            self.known |= {rows[k]: take(found, torch.tensor([i])) for i, k in enumerate(new)}
+        every = cat([self.known[row] for row in rows])
+        return map_tensors(every, lambda tensor: tensor.to(observation.points.device))
+
+    @torch.no_grad()
+    def _ask(self, observation: Observation) -> Told:
+        said = self.method.predict(observation, self.mode)
+        pose, joints = said.camera_T_part, said.joints
+        shape, part = said.canonical_points, said.canonical_part
+        if pose is None or joints is None or shape is None or part is None:
+            raise ValueError(f"{self.method.name}: expected poses, joints and a shape with parts")
+        _, similarity = normalise(observation.points)
+        scale, base = similarity.scale[:, None], pose[:, 0]
+        slide = torch.tensor([one.kind == "prismatic" for one in self.method.category.joints])
+        return Told(
+            rotation=base[:, :3, :3],
+            translation=similarity.forward(base[:, None, :3, 3])[:, 0],
+            shape=shape[:, :POINTS] * scale[..., None],
+            part=part[:, :POINTS],
+            pivot=apply(invert(base), joints.pivot) * scale[..., None],
+            axis=joints.axis @ base[:, :3, :3],
+            state=torch.where(slide, joints.state * scale, joints.state),
+        )
+
+
+def load_run(path: Path, category: Category) -> RegisteredScapo:
+    """The trained model of a `registered` run folder or checkpoint file.
+
+    Raises:
+        StoreError: None there, of another method, or of another category.
+    """
+    arrays, header = read_checkpoint(path)
+    kind = header_category(check_header(header, str(path)), str(path))
+    if header["method"] != RegisteredScapo.name or kind != category:
+        raise StoreError(
+            f"{path}: expected a run of {RegisteredScapo.name} on {category.name}, found one of "
+            f"{header['method']} on {kind.name}"
+        )
+    config = config_from(RegisteredConfig, header["config"], f"{path}: config")
+    method = RegisteredScapo(config, kind, torch.Generator())
+    load_arrays(method, arrays, path)
+    return method.eval()
+
+
+def imitation(
+    encoding: Encoding,
+    shape: Float[Tensor, "B K 3"],
+    told: Told,
+    kinds: Kinds,
+    config: LossConfig,
+) -> dict[str, Float[Tensor, ""]]:
+    """What takes the place of stage 1's losses: frames as told, and whole shapes in them.
+
+    Args:
+        encoding: Of clouds.
+        shape: S_dec of their codes.
+        told: Of these clouds, in the same frame.
+        kinds: Of the joints.
+        config: Weights of `rec` and `ortho`.
+    """
+    frame = losses.pose_agreement(
+        encoding.rotation, encoding.translation, told.rotation, told.translation
+    )
+    return {
+        "frame": frame,
+        "rec": config.rec * chamfer(told.observed(kinds), shape).mean(),
+        "ortho": config.ortho * losses.orthonormality(encoding.frame),
+    }
