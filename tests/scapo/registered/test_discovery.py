@@ -81,7 +81,7 @@ def test_mirror_images_take_the_first_round_on_half_of_the_views(
         return best
 
     for name, step in {
-        "_first": lambda *_: [first],
+        "_of_draws": lambda *_: [first],
         "completed": completing,
         "advance": advancing,
         "densified": lambda best, *_: best,

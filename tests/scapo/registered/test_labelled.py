@@ -174,8 +174,14 @@ def test_labels_change_nothing_where_they_are_not_declared() -> None:
         one = method.losses(some, labels, step)
         other = method.losses(some, Labels(), replace(step, generator=generator(2)))
     assert {k: float(v) for k, v in one.items()} == {k: float(v) for k, v in other.items()}
-    assert RegisteredScapo.supervision == frozenset()
-    assert SEEN.labels.keep(RegisteredScapo.supervision) == Labels()
+    bare = RegisteredScapo(RegisteredConfig(), CATEGORIES["oven"], generator(0))
+    assert bare.supervision == frozenset()
+    assert SEEN.labels.keep(bare.supervision) == Labels()
+    config = RegisteredConfig(supervision=("instance",))
+    told = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    assert SEEN.labels.keep(told.supervision) == Labels(instance=SEEN.labels.instance)
+    assert told.variant == "objects known"
+    assert not bare.variant
 
 
 def test_a_stored_one_answers_alike(made: LabelledRegistered) -> None:
