@@ -242,7 +242,7 @@ class Steps:
 def closing_words(demo: Demo, seconds: float) -> str:
     """What was done, where it lies, and what to do next."""
     trained = f"trained from scratch on {demo.train} clouds: {', '.join(demo.methods)}"
-    models = trained if demo.methods else "answered by the released models, trained without labels"
+    models = trained if demo.methods else "answered by the released models"
     twins = f"""
   twins     {demo.out}/twins/NAME/  of one depth image each ({demo.out}/scans/NAME.png):
             joints.json, a URDF for simulators, a GLB, and a page with a slider for each joint
