@@ -27,7 +27,7 @@ vulkan: ## look for a Vulkan device again, and install a driver where there is n
 demo: setup ## the whole idea: render, predict by the released models, score, print the table, make twins
 	@$(BIN)/python -m bench.demo $(ARGS)
 
-demo-train: setup ## the same of ovens with a model that is trained from scratch, about 15 minutes
+demo-train: setup ## the same of ovens with a model that is trained from scratch
 	@$(BIN)/python -m bench.demo --out results/demo-train --categories oven --train 640 --test 200 \
 	  --methods registered icp $(ARGS)
 

@@ -30,7 +30,7 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import first_candidates
 from scapo.registered.objects import known_objects, object_candidates, owned_views
 from scapo.registered.pose_search import (
-    OwnedViews,
+    Searched,
     SearchResult,
     find_inliers,
     search_views,
@@ -41,7 +41,6 @@ from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
 
-Searched = PartialViews | OwnedViews
 JUDGES = 4  # At most one view in so many is held out
 STRIDE = 3  # Views by which the draws are apart
 
@@ -90,11 +89,7 @@ def discover(
         best, shares = completed(best, judges, half, config, generator), shares[1:]
     for share in shares:
         best = advance(best, searched, share, config, generator)
-        logger.info(
-            "bundle adjustment of the %d inliers among %d views",
-            len(best.inliers.views.points),
-            config.searched,
-        )
+        logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
     best = densified(best, config, generator)
     if config.leans:
         best = with_axis_deviation(best, judges, config, generator)

@@ -19,6 +19,7 @@ from itertools import permutations, product
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from scapo.categories import JointKind
@@ -33,7 +34,7 @@ from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
 from scapo.registered.views import TINY, PartialViews
 
-LEAST_OBJECTS = 4  # That are gone on with
+LEAST_OBJECTS = 4  # That a first template is made of
 LEAST_SHOWN = 8  # Clouds of an object, at least, that are registered with one another
 AGREEING = 0.8  # Share of an object's views, those that agree best, that are gone on with
 FITTED = 60  # Views, at most, that a template is fitted to
@@ -159,7 +160,7 @@ def object_candidate(
 ) -> Candidate:
     """The first template of several objects."""
     readings = agreeing(known, kinds)
-    halves = torch.stack([x.turn.abs() @ one.half for one, x in _zip(known, readings)])
+    halves = torch.stack([x.turn.abs() @ one.half for one, x in zip(known, readings, strict=True)])
     size = (halves.log() - halves.log().mean(0)).clamp(-SIZES, SIZES)
     start = _joined(
         [_in_common(one, x, scale) for one, x, scale in zip(known, readings, size, strict=True)]
@@ -176,10 +177,12 @@ def object_candidate(
 def grouped(instance: Int[Tensor, " N"], config: DiscoveryConfig) -> list[Int[Tensor, " K"]]:
     """Which clouds are looked at of which objects, spread over all.
 
-    Objects of too few clouds (`LEAST_SHOWN`) are passed over.
+    Objects of too few clouds (`LEAST_SHOWN`) are passed over, and all where few objects are left.
     """
     every = [(instance == number).nonzero()[:, 0] for number in instance.unique()]
     every = [rows for rows in every if len(rows) >= LEAST_SHOWN]
+    if len(every) < LEAST_OBJECTS:
+        return []
     some = evenly(len(every), config.objects).tolist()
     return [every[k][evenly(len(every[k]), config.object_views)] for k in some]
 
@@ -213,23 +216,20 @@ def agreeing(objects: list[OneObject], kinds: tuple[JointKind, ...]) -> list[_Re
     """
     readings = [_readings(one, kinds) for one in objects]
     tables = [
-        torch.stack([_signature(one, x) for x in some]) for one, some in _zip(objects, readings)
+        torch.stack([_signature(one, x) for x in some])
+        for one, some in zip(objects, readings, strict=True)
     ]
     best, most = [0] * len(objects), -torch.inf
     for start in range(len(objects)):
         mean, chosen = tables[start][0], list[int]()
         for _ in range(SWEEPS):
             old, chosen = chosen, [int((table @ mean).argmax()) for table in tables]
-            mean = torch.stack([table[k] for table, k in _zip(tables, chosen)]).mean(0)
+            mean = torch.stack([table[k] for table, k in zip(tables, chosen, strict=True)]).mean(0)
             if chosen == old:
                 break
         if float(mean.square().sum()) > most:
             best, most = chosen, float(mean.square().sum())
-    return [some[k] for some, k in _zip(readings, best)]
-
-
-def _zip(first: Sequence, second: Sequence) -> zip:
-    return zip(first, second, strict=True)
+    return [some[k] for some, k in zip(readings, best, strict=True)]
 
 
 def _readings(one: OneObject, kinds: tuple[JointKind, ...]) -> list[_Reading]:
@@ -268,14 +268,7 @@ def _signature(one: OneObject, reading: _Reading) -> Float[Tensor, " D"]:
 
 def quarter_turns() -> list[Float[Tensor, "3 3"]]:
     """The 24 rotations that take the axes of a frame to its axes."""
-    turns = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            turn = torch.zeros(3, 3)
-            turn[range(3), order] = torch.tensor(signs)
-            if torch.det(turn) > 0:
-                turns.append(turn)
-    return turns
+    return list(torch.from_numpy(Rotation.create_group("O").as_matrix().round()).float())
 
 
 def _in_common(one: OneObject, reading: _Reading, log_scale: Float[Tensor, " 3"]) -> _Start:

@@ -22,6 +22,7 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.joint_limits import JointLimits, limits_of, narrowest_limits
 from scapo.registered.pairwise import distinct, within
 from scapo.registered.pose_refinement import CHUNK, LIGHT, StepOptions, refine, search_states
+from scapo.registered.synchronisation import densest
 from scapo.registered.template import ArticulatedTemplate, Placement, interleave
 from scapo.registered.view_bank import ShownPoints, ViewBank
 from scapo.registered.views import PartialViews
@@ -78,9 +79,7 @@ STATE_GRID, STATE_EVERY = 13, 2
 """States that are tried then, and one in so many points that they are tried with."""
 STATE_STEPS = StepOptions(steps=5, points=256)  # Steps that follow
 VOTE = 30.0  # How sharply the losses of a view's hypotheses share its vote
-AGREEING, AGREES = 8.0, 25.0
-"""Of exp(-AGREEING angle^2) by which hypotheses support each other, and degrees from the object's
-frame within which one agrees with it."""
+AGREES = 25.0  # Degrees from the object's frame within which a hypothesis agrees with it
 MORE = 0.3  # Share of the views that agree with others of their object, beyond that of bare views
 LOSS_SHARE = 0.5  # Of a placement's loss that counts against its margin when views are ranked
 LEAST_INLIERS = 8  # Views that a template is fitted to at least
@@ -152,6 +151,9 @@ class OwnedViews:
     """Which object a view shows."""
 
 
+Searched = PartialViews | OwnedViews
+
+
 def best_of(
     placement: Placement, loss: Float[Tensor, "B F"], unlike: Float[Tensor, "B F"]
 ) -> SearchResult:
@@ -188,25 +190,22 @@ def voted(
     count = len(searched.owner)
     state = hypotheses.placement.state.unflatten(0, (count, -1))
     loss = hypotheses.loss + limits.penalty(state)
-    table = loss + hypotheses.unlike
-    rotation = hypotheses.placement.rotation.unflatten(0, table.shape)
+    rotation = hypotheses.placement.rotation.unflatten(0, loss.shape)
     frames = rotation.mT @ searched.rotation[:, None]  # template_R_object
-    vote = torch.softmax(-VOTE * table, 1)
-    chosen = torch.zeros_like(table)
+    vote = torch.softmax(-VOTE * (loss + hypotheses.unlike), 1)
+    trace = torch.zeros_like(loss)  # With the object's frame
     for number in searched.owner.unique():
-        rows = (searched.owner == number).nonzero()[:, 0]
-        flat = frames[rows].flatten(0, 1).flatten(1)
-        near = torch.exp(-AGREEING * (3 - flat @ flat.mT).clamp_min(0))  # 3 - trace: angle squared
-        best = (near @ vote[rows].flatten()).argmax()
-        chosen[rows] = (frames[rows].flatten(2) @ flat[best]).to(chosen)
-    table = table + NO_RIVAL * ~within(chosen, AGREES)
-    found = best_of(hypotheses.placement, loss, table - loss)
-    return found, within(chosen, AGREES).any(1)
+        own = searched.owner == number
+        frame, _ = densest(frames[own].flatten(0, 1), vote[own].flatten())
+        trace[own] = (frames[own] * frame).sum((-1, -2))
+    agrees = within(trace, AGREES)
+    unlike = hypotheses.unlike + NO_RIVAL * ~agrees
+    return best_of(hypotheses.placement, loss, unlike), agrees.any(1)
 
 
 def find_inliers(
     candidate: Candidate,
-    searched: PartialViews | OwnedViews,
+    searched: Searched,
     share: float,
     config: DiscoveryConfig,
     *,

@@ -92,7 +92,7 @@ def _vote(graph: _Graph, root: int) -> tuple[Tensor, Tensor]:
     for _ in range(SWEEPS):
         old = rotation.clone()
         for i in range(count):
-            rotation[i], known[i] = _densest(
+            rotation[i], known[i] = densest(
                 (rotation[:, None] @ graph.rotation[i]).flatten(0, 1),
                 (graph.vote[i] * known[:, None]).flatten(),
             )
@@ -101,7 +101,7 @@ def _vote(graph: _Graph, root: int) -> tuple[Tensor, Tensor]:
     return rotation, known
 
 
-def _densest(proposals: Float[Tensor, "V 3 3"], vote: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
+def densest(proposals: Float[Tensor, "V 3 3"], vote: Float[Tensor, " V"]) -> tuple[Tensor, Tensor]:
     """The proposal with most votes about it, averaged over them, and their share."""
     kept = vote.topk(min(len(vote), PROPOSALS)).indices
     flat = proposals[kept].flatten(1)

@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, NoReturn
 
 import pytest
 import torch
 
+from scapo.categories import CATEGORIES
 from scapo.geometry.rigid import axis_angle, random_rotations, rotation_angle
+from scapo.registered import method
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.joint_proposals import JointProposal, PosedViews
+from scapo.registered.method import RegisteredConfig, RegisteredScapo
 from scapo.registered.objects import (
     OneObject,
     agreeing,
@@ -23,6 +27,7 @@ from scapo.registered.objects import (
 )
 from scapo.registered.pose_search import Hypotheses, voted
 from scapo.registered.template import Placement
+from scapo.types import Labels, Observation
 from tests.helpers.sighted import AXIS, sighted
 from tests.helpers.strategies import generator
 
@@ -72,13 +77,36 @@ def test_an_axis_that_one_object_told_badly_is_taken_from_the_others() -> None:
 
 
 def test_groups_hold_clouds_of_one_object_and_pass_over_those_with_few() -> None:
-    instance = torch.tensor([3] * 20 + [5] * 4 + [8] * 9 + [1] * 12)[torch.randperm(45)]
+    order = torch.randperm(54, generator=generator(0))
+    instance = torch.tensor([3] * 20 + [5] * 4 + [8] * 9 + [1] * 12 + [9] * 9)[order]
     config = DiscoveryConfig(objects=10, object_views=10)
     groups = grouped(instance, config)
-    assert [instance[rows].unique().tolist() for rows in groups] == [[1], [3], [8]]
-    assert [len(rows) for rows in groups] == [10, 10, 9]
+    assert [instance[rows].unique().tolist() for rows in groups] == [[1], [3], [8], [9]]
+    assert [len(rows) for rows in groups] == [10, 10, 9, 9]
     assert len(grouped(instance, DiscoveryConfig(objects=2))) == 2
+    assert grouped(instance[instance != 9], config) == []  # three objects tell no category
     assert grouped(torch.arange(40), config) == []
+
+
+@pytest.mark.parametrize("each", [5, 8])
+def test_clouds_are_grouped_where_each_object_shows_enough(
+    each: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told: list[int] = []
+
+    def discovering(*args: Any) -> NoReturn:
+        told.extend(len(views.points) for views in args[4])
+        raise InterruptedError
+
+    monkeypatch.setattr(method, "discover", discovering)
+    config = RegisteredConfig(supervision=("instance",), points=32)
+    registered = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    points = torch.randn(4 * each, 64, 3, generator=generator(1)) + torch.tensor([0.0, 0, 9])
+    labels = Labels(instance=torch.arange(4).repeat(each))
+    with pytest.raises(InterruptedError):
+        registered.start("votes", Observation(points=points), labels, generator(2))
+    assert told == ([8] * 4 if each == 8 else [])
+    assert ("too few clouds" in caplog.text) == (each == 5)
 
 
 def test_views_of_each_object_are_owned_by_it() -> None:
