@@ -65,11 +65,10 @@ def main(data: str, category: str, seed: int) -> None:
         frame = middle(turns)
         off = rotation_angle(turns, frame.expand_as(turns)).rad2deg()
         axis = frame @ (torch.stack(poses).mT @ torch.stack(axes).mT).mean(0).mT[0]
-        lean = axis_angle(one.proposals[0][0].axis, axis / axis.norm()).rad2deg()
+        lean = float(axis_angle(one.proposals[0][0].axis, axis / axis.norm()).rad2deg())
         share = 100 * float((off < RIGHT).float().mean())
-        print(
-            f"views right {share:.0f} %, best axis of the first joint off by {min(lean, 180 - lean):.1f}"
-        )
+        lean = min(lean, 180 - lean)
+        print(f"views right {share:.0f} %, best axis of the first joint off by {lean:.1f}")
         frames.append(reading.turn @ frame)
     turns = torch.stack(frames)
     off = rotation_angle(turns, middle(turns).expand_as(turns)).rad2deg()

@@ -25,6 +25,7 @@ Verdict = Literal["read", "refused", "traceback", "hang", "memory", "wrongly rea
 SECONDS = 30.0
 """Of the processor; more is a hang."""
 BYTES = 2 << 30
+"""That the process's peak may grow by; it stands higher where other tests ran before."""
 BATCH = 25
 """Cases between two starts of a worker's job."""
 
@@ -63,17 +64,22 @@ class Game:
             if not path.exists() or path.read_bytes() != good:
                 path.write_bytes(good)
         self.file.write_bytes(data)
-        begun = time.process_time()
+        begun, before = time.process_time(), peak()
         finding = judge(self.format, self.file)
         if time.process_time() - begun > SECONDS:
             return Finding(verdict="hang", words=finding.words)
-        if 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > BYTES:
+        if peak() - before > BYTES:
             return Finding(verdict="memory", words=finding.words)
         return finding
 
     def close(self) -> None:
         """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def peak() -> int:
+    """The most bytes that this process has held."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def play_batch(job: tuple[str, str, int], report: Report) -> dict[int, tuple[str, str]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.fuzz import play
 from tests.fuzz.formats import FORMATS
 from tests.fuzz.found import FOUND
 from tests.fuzz.play import Game
@@ -36,3 +37,14 @@ def test_what_was_found_stays_refused(number: int, tmp_path: Path):
     game = Game(name, tmp_path / "game")
     finding = game.attempt(change(game.good[game.file]))
     assert finding.verdict == "refused", finding.words
+
+
+@pytest.mark.parametrize(("spare", "verdict"), [(64 << 20, "read"), (-1, "memory")])
+def test_only_what_a_file_itself_takes_is_held_against_it(
+    spare: int, verdict: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    # What ran in this process before has held more than this already.
+    monkeypatch.setattr(play, "BYTES", spare)
+    assert play.peak() > spare
+    game = Game("STL", tmp_path / "game")
+    assert game.attempt(game.good[game.file]).verdict == verdict
