@@ -39,12 +39,15 @@ LEAST_OBJECTS = 4  # That a first template is made of
 LEAST_SHOWN = 8  # Clouds of an object, at least, that are registered with one another
 AGREEING = 0.8  # Share of an object's views, those that agree best, that are gone on with
 FITTED = 60  # Views, at most, that a template is fitted to
-WIDEST = 0.42  # Share of the objects that are gone on with: those whose cameras are farthest apart
+SURE, SHOWN = 0.67, 0.42
+"""Share of the objects whose frames are surest, and of all those among them whose parts other views
+show best: a first template is made of these."""
 LEAST_HALF = 0.02  # Normalised length: half the side of a body's box at least
 FARTHEST = 1.5  # Halves of the body's box beyond which a part is not farther away
 SIZES = 1.0  # Largest log scale of a body's box against the others'
 WEIGHT_CAMERA, WEIGHT_SPREAD, WEIGHT_WAY, WEIGHT_AXIS = 1.3, 2.0, 1.0, 1.0
 """Of what two objects are compared by; their sums of products are what agrees."""
+SUPPORT = 3.0  # Of mean log support against the log of how far cameras are spread
 SURER = 30.0  # Power of a proposal's score against the best one's, by which its axis counts
 SWEEPS = 10  # Over all objects, in which each takes the frame that agrees best with the others
 
@@ -128,13 +131,14 @@ def known_objects(
 ) -> list[OneObject]:
     """The objects each by itself, the surest first.
 
-    Where views of two sides of an object were taken for one side, cameras gather; where what moved
-    is known, other views show it where it would be.
+    Where views of two sides of an object were taken for one side, cameras gather; where poses are
+    right, views confirm each other's points.
     """
     known = [one_object(views, kinds, config, generator) for views in objects]
     spread = torch.stack([one.cameras().var(0).sum() for one in known])
-    shown = torch.tensor([min(motion.score for motion in one.motions) for one in known])
-    return [known[k] for k in (spread * shown).argsort(descending=True).tolist()]
+    support = torch.tensor([min(motion.support for motion in one.motions) for one in known])
+    sure = spread * (SUPPORT * support).exp()
+    return [known[k] for k in sure.argsort(descending=True).tolist()]
 
 
 def object_candidates(
@@ -143,7 +147,7 @@ def object_candidates(
     config: DiscoveryConfig,
     generator: torch.Generator,
 ) -> list[Candidate]:
-    """First templates of those objects that are surest, and of two thirds of them.
+    """First templates of those sure objects whose motions are surest, and of two thirds of them.
 
     Args:
         objects: The surest first (`known_objects`).
@@ -151,8 +155,10 @@ def object_candidates(
         config: Points of a template, and options of the first fit.
         generator: Draws points.
     """
-    widest = objects[: max(LEAST_OBJECTS, round(WIDEST * len(objects)))]
-    draws = [widest, *([one for k, one in enumerate(widest) if k % 3 != d] for d in range(3))]
+    sure = objects[: max(LEAST_OBJECTS, round(SURE * len(objects)))]
+    shown = sorted(sure, key=lambda one: -min(motion.score for motion in one.motions))
+    shown = shown[: max(LEAST_OBJECTS, round(SHOWN * len(objects)))]
+    draws = [shown, *([one for k, one in enumerate(shown) if k % 3 != d] for d in range(3))]
     return [
         object_candidate(draw, kinds, config, generator)
         for draw in draws[: config.draws]

@@ -48,6 +48,8 @@ class Motion:
     """The part's among the first K points of each view."""
     score: float
     """Mean share of the part's points that other views show at their states."""
+    support: float
+    """Mean over all points of the log support by the motion, of the two, that fits better."""
 
     def back(
         self, posed: PosedViews, joint: JointProposal, kind: JointKind
@@ -73,7 +75,7 @@ def motion_of(
         kind: Of the joint.
     """
     count = moved.shape[1]
-    state, score = torch.zeros(len(moved)), 0.0
+    state, score, log_support = torch.zeros(len(moved)), 0.0, torch.zeros(1)
     for _ in range(ROUNDS):
         table = _pair_scores(posed, moved, joint, kind)
         state, score = synchronised_states(table, AMOUNT[kind][1] / STEPS)
@@ -81,10 +83,12 @@ def motion_of(
         own = torch.arange(len(state))
         none = torch.zeros_like(posed.translation)
         evidence = gather_evidence(posed.views, poses, none, count=count, observers=own)
-        support = smooth(posed.views, evidence.log_support)
+        log_support = evidence.log_support
+        support = smooth(posed.views, log_support)
         moved = favouring_base(support - support.mean(-1, keepdim=True)).argmax(-1) == 1
     middle = state.quantile(torch.tensor(ENDS)).mean()
-    return Motion(state=state - middle, moved=moved, score=score)
+    mean = float(log_support.amax(-1).mean())
+    return Motion(state=state - middle, moved=moved, score=score, support=mean)
 
 
 def _pair_scores(
