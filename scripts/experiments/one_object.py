@@ -15,7 +15,7 @@ import sys
 import torch
 
 from scapo import store
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, JointKind
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import axis_angle, project_rotation, rotation_angle
 from scapo.registered.config import DiscoveryConfig
@@ -38,7 +38,7 @@ def middle(turns: torch.Tensor) -> torch.Tensor:
 def main(data: str, category: str, seed: int) -> None:
     """Print a line for each object, the surest first, and one for all of them."""
     split, config = store.dataset(data, category, "train"), DiscoveryConfig()
-    kinds = tuple(joint.kind for joint in CATEGORIES[category].joints)
+    kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in CATEGORIES[category].joints)
     instance = torch.tensor([int(split[k]["instance"]) for k in range(len(split))])
     shown, truth = (
         list[PartialViews](),
