@@ -39,6 +39,7 @@ from scapo.method import evenly
 from scapo.predictor import find
 from scapo.store import Split, StoreError, open_split
 from scapo.store.checkpoint import WEIGHTS
+from scapo.store.files import require_suffix
 
 FOLDS = 5
 """Of the objects: probabilities that `reliability` judges come from maps fitted without them."""
@@ -73,8 +74,10 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
         The calibration, and the files written.
 
     Raises:
-        StoreError: No such model or data, or too few samples.
+        StoreError: No such model or data, too few samples, or a picture that is no PNG.
     """
+    if request.picture is not None:
+        require_suffix(request.picture, ".png")
     checkpoint = find(request.checkpoint)
     file = checkpoint / WEIGHTS if checkpoint.is_dir() else checkpoint
     model = load_model(file, pick_device(request.device), None)

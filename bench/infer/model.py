@@ -15,6 +15,7 @@ from scapo.predictor import Predictor, find, released
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
+from scapo.text import did_you_mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,6 +85,7 @@ def load_models(run: Path | None, category: str | None, device: str, mode: Mode)
         known = f"one of {', '.join(weights)}" if weights else "none, as no model is released yet"
         raise StoreError(
             f"--category {category}: expected {known}; a run of your own is given by --run RUN"
+            f"{did_you_mean(category, weights)}"
         )
     names = list(weights) if category is None else [category]
     if not names:
