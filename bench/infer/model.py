@@ -56,7 +56,7 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
         StoreError: None there, or a calibration that belongs to another.
     """
     path = find(what)
-    file = path / WEIGHTS if path.is_dir() else path
+    file = weights_file(path)
     method, header = load(path)
     digest = sha256_file(file)
     beside = None if mode is None else calibration_file(file, mode)
@@ -68,6 +68,11 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
         digest=digest,
         calibration=read_calibration(beside, digest) if beside and beside.is_file() else None,
     )
+
+
+def weights_file(path: Path) -> Path:
+    """The checkpoint of a run folder, or the file itself."""
+    return path / WEIGHTS if path.is_dir() else path
 
 
 def load_models(run: Path | None, category: str | None, device: str, mode: Mode) -> list[Model]:

@@ -77,8 +77,8 @@ def is_own(port: int, one: Upload, place: str) -> bool:
         for name in ("joints.json", "parts.ply", "object/mobility.urdf")
     )
     said = json.loads(record)
-    cloud = trimesh.load_scene(io.BytesIO(parts), file_type="ply", process=False).to_geometry()
-    same = np.array_equal(np.asarray(cloud.vertices, np.float32), one.points)
+    scene = trimesh.load_scene(io.BytesIO(parts), file_type="ply", process=False)
+    same = np.array_equal(scene.geometry["geometry_0"].vertices.astype(np.float32), one.points)
     named = said["input"] == one.name and said["category"]["name"] == one.category
     return same and named and one.name.encode() in get(port, place) and b"<robot" in urdf
 
