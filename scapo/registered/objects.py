@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, product
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -33,6 +34,8 @@ from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
 from scapo.registered.views import TINY, PartialViews
+
+T = TypeVar("T")
 
 LEAST_OBJECTS = 4  # That a first template is made of
 LEAST_SHOWN = 8  # Clouds of an object, at least, that are registered with one another
@@ -114,42 +117,25 @@ def owned_views(objects: Sequence[OneObject], count: int) -> OwnedViews:
     )
 
 
-def known_objects(
-    objects: Sequence[PartialViews],
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[OneObject]:
-    """The objects each by itself, those whose cameras are farthest apart first.
+def surest_first(known: Sequence[OneObject]) -> list[OneObject]:
+    """The objects, those whose cameras are farthest apart first.
 
     Where views of two sides of an object were taken for one side, cameras gather.
     """
-    known = [one_object(views, kinds, config, generator) for views in objects]
     spread = torch.stack([one.cameras().var(0).sum() for one in known])
     return [known[k] for k in spread.argsort(descending=True).tolist()]
 
 
-def object_candidates(
-    objects: Sequence[OneObject],
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[Candidate]:
-    """First templates of those objects that are surest, and of two thirds of them.
+def draws_of(objects: Sequence[T], count: int) -> list[list[T]]:
+    """So many draws, 4 at most: those objects that are surest, and two thirds of them each.
 
     Args:
-        objects: The surest first (`known_objects`).
-        kinds: Of the joints.
-        config: Points of a template, and options of the first fit.
-        generator: Draws points.
+        objects: The surest first (`surest_first`).
+        count: Of the draws, before those with too few objects are left out.
     """
-    widest = objects[: max(LEAST_OBJECTS, round(WIDEST * len(objects)))]
+    widest = list(objects[: max(LEAST_OBJECTS, round(WIDEST * len(objects)))])
     draws = [widest, *([one for k, one in enumerate(widest) if k % 3 != d] for d in range(3))]
-    return [
-        object_candidate(draw, kinds, config, generator)
-        for draw in draws[: config.draws]
-        if len(draw) >= LEAST_OBJECTS
-    ]
+    return [draw for draw in draws[:count] if len(draw) >= LEAST_OBJECTS]
 
 
 def object_candidate(
@@ -208,7 +194,7 @@ def one_object(
     )
 
 
-def agreeing(objects: list[OneObject], kinds: tuple[JointKind, ...]) -> list[_Reading]:
+def agreeing(objects: Sequence[OneObject], kinds: tuple[JointKind, ...]) -> list[_Reading]:
     """How each object is read so that all agree.
 
     Every object starts a consensus in turn; each object takes the reading nearest to the mean of
