@@ -123,47 +123,35 @@ def owned_views(objects: Sequence[OneObject], count: int) -> OwnedViews:
     )
 
 
-def known_objects(
-    objects: Sequence[PartialViews],
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[OneObject]:
-    """The objects each by itself, the surest first.
+def surest_first(known: Sequence[OneObject]) -> list[OneObject]:
+    """The objects, those whose frames are surest first.
 
     Where views of two sides of an object were taken for one side, cameras gather; where poses are
     right, views confirm each other's points.
     """
-    known = [one_object(views, kinds, config, generator) for views in objects]
     spread = torch.stack([one.cameras().var(0).sum() for one in known])
     support = torch.tensor([min(motion.support for motion in one.motions) for one in known])
     sure = spread * (SUPPORT * support).exp()
     return [known[k] for k in sure.argsort(descending=True).tolist()]
 
 
-def object_candidates(
-    objects: Sequence[OneObject],
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[Candidate]:
-    """First templates of those sure objects whose motions are surest, and of two thirds of them.
+def draws_of(objects: Sequence[OneObject], count: int) -> list[list[OneObject]]:
+    """So many draws, 4 at most, of sure objects whose motions are surest.
 
     Args:
-        objects: The surest first (`known_objects`).
-        kinds: Of the joints.
-        config: Points of a template, and options of the first fit.
-        generator: Draws points.
+        objects: The surest first (`surest_first`).
+        count: Of the draws, before those with too few objects are left out.
     """
     sure = objects[: max(LEAST_OBJECTS, round(SURE * len(objects)))]
     shown = sorted(sure, key=lambda one: -min(motion.score for motion in one.motions))
-    shown = shown[: max(LEAST_OBJECTS, round(SHOWN * len(objects)))]
-    draws = [shown, *([one for k, one in enumerate(shown) if k % 3 != d] for d in range(3))]
-    return [
-        object_candidate(draw, kinds, config, generator)
-        for draw in draws[: config.draws]
-        if len(draw) >= LEAST_OBJECTS
-    ]
+    return [[shown[k] for k in rows] for rows in rows_of_draws(len(objects), count)]
+
+
+def rows_of_draws(total: int, count: int) -> list[list[int]]:
+    """Which of the objects whose motions are surest each draw has: all, then two thirds of them."""
+    shown = range(min(total, max(LEAST_OBJECTS, round(SHOWN * total))))
+    draws = [list(shown), *([k for k in shown if k % 3 != d] for d in range(3))]
+    return [draw for draw in draws[:count] if len(draw) >= LEAST_OBJECTS]
 
 
 def object_candidate(
@@ -228,7 +216,7 @@ def one_object(
     )
 
 
-def agreeing(objects: list[OneObject], kinds: tuple[JointKind, ...]) -> list[_Reading]:
+def agreeing(objects: Sequence[OneObject], kinds: tuple[JointKind, ...]) -> list[_Reading]:
     """How each object is read so that all agree.
 
     Every object starts a consensus in turn; each object takes the reading nearest to the mean of

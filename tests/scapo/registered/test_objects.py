@@ -20,10 +20,11 @@ from scapo.registered.objects import (
     OneObject,
     agreeing,
     grouped,
-    known_objects,
     object_candidate,
+    one_object,
     owned_views,
     quarter_turns,
+    surest_first,
 )
 from scapo.registered.pose_search import Hypotheses, voted
 from scapo.registered.template import Placement
@@ -152,7 +153,8 @@ def test_a_template_is_found_from_views_of_a_few_objects() -> None:
     some = [sighted(8, seed=50 * k) for k in range(4)]
     config = DiscoveryConfig(rotations=300, template_points=150)
     with_truth = {tuple(v.points[i, 0].tolist()): t.rotation[i] for v, t in some for i in range(8)}
-    shown = known_objects([v for v, _ in some], ("revolute",), config, generator(0))
+    g = generator(0)
+    shown = surest_first([one_object(views, ("revolute",), config, g) for views, _ in some])
     found = object_candidate(shown, ("revolute",), config, generator(0))
     views, placement = found.inliers.views, found.inliers.placement
     truth = torch.stack([with_truth[tuple(p.tolist())] for p in views.points[:, 0]])
