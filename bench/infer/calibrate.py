@@ -26,7 +26,7 @@ from bench.infer.calibration import (
     write_calibration,
 )
 from bench.infer.cloud import Cloud
-from bench.infer.model import Model, load_model
+from bench.infer.model import Model, load_model, weights_file
 from bench.matching import calibrate as fit_frames
 from bench.matching import choose_order, rotation_degrees
 from bench.metrics import line_degrees
@@ -38,7 +38,7 @@ from scapo.geometry.part_order import confusion
 from scapo.method import evenly
 from scapo.predictor import find
 from scapo.store import Split, StoreError, open_split
-from scapo.store.checkpoint import WEIGHTS
+from scapo.store.files import require_suffix
 
 FOLDS = 5
 """Of the objects: probabilities that `reliability` judges come from maps fitted without them."""
@@ -73,10 +73,11 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
         The calibration, and the files written.
 
     Raises:
-        StoreError: No such model or data, or too few samples.
+        StoreError: No such model or data, too few samples, or a picture that is no PNG.
     """
-    checkpoint = find(request.checkpoint)
-    file = checkpoint / WEIGHTS if checkpoint.is_dir() else checkpoint
+    if request.picture is not None:
+        require_suffix(request.picture, ".png")
+    file = weights_file(find(request.checkpoint))
     model = load_model(file, pick_device(request.device), None)
     split = open_split(request.data, model.category.name, request.split)
     labelled = _labelled(split, request.limit)

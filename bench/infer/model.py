@@ -15,6 +15,7 @@ from scapo.predictor import Predictor, find, released
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
+from scapo.text import did_you_mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,7 +56,7 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
         StoreError: None there, or a calibration that belongs to another.
     """
     path = find(what)
-    file = path / WEIGHTS if path.is_dir() else path
+    file = weights_file(path)
     method, header = load(path)
     digest = sha256_file(file)
     beside = None if mode is None else calibration_file(file, mode)
@@ -67,6 +68,11 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
         digest=digest,
         calibration=read_calibration(beside, digest) if beside and beside.is_file() else None,
     )
+
+
+def weights_file(path: Path) -> Path:
+    """The checkpoint of a run folder, or the file itself."""
+    return path / WEIGHTS if path.is_dir() else path
 
 
 def load_models(run: Path | None, category: str | None, device: str, mode: Mode) -> list[Model]:
@@ -84,6 +90,7 @@ def load_models(run: Path | None, category: str | None, device: str, mode: Mode)
         known = f"one of {', '.join(weights)}" if weights else "none, as no model is released yet"
         raise StoreError(
             f"--category {category}: expected {known}; a run of your own is given by --run RUN"
+            f"{did_you_mean(category, weights)}"
         )
     names = list(weights) if category is None else [category]
     if not names:
