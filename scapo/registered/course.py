@@ -22,9 +22,10 @@ from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import fitted_of_each
 from scapo.registered.joint_proposals import JointProposal, PosedViews
-from scapo.registered.objects import OneObject, draws_of
+from scapo.registered.objects import OneObject, rows_of_draws
 from scapo.registered.pose_search import SearchResult
 from scapo.registered.template import ArticulatedTemplate, Placement
+from scapo.registered.view_states import Motion
 from scapo.registered.views import PartialViews
 
 T = TypeVar("T")
@@ -32,13 +33,14 @@ T = TypeVar("T")
 JUDGES = 4  # At most one view in so many is held out
 PAIR, GRID = 0.010, 1000
 """Seconds of one core, as all below: a pair of views that is registered over so many rotations."""
-FIRST_FIT, OBJECT, FIT, DENSE, DEVIATION = 12.0, 4.0, 5.0, 4.0, 45.0
+FIRST_FIT, OBJECT, FIT, DENSE, DEVIATION = 12.0, 5.0, 5.0, 4.0, 45.0
 """A first template; an object beside its pairs; bundle adjustment after a search; a dense template;
 templates whose axes deviate."""
 VIEW = 0.1  # A view that is searched
 BELIEF = 20.0  # Seconds of steps for which usual times count, beside those that were measured
 RECORDS: tuple[type[Any], ...] = (
-    Candidate, Inliers, JointProposal, OneObject, PartialViews, Placement, PosedViews, SearchResult,
+    Candidate, Inliers, JointProposal, Motion, OneObject, PartialViews, Placement, PosedViews,
+    SearchResult,
 )  # fmt: skip
 """What steps return, beside templates."""
 
@@ -88,7 +90,7 @@ def _of_objects(config: DiscoveryConfig, objects: int) -> tuple[dict[str, float]
     """The first steps, and how many templates they give."""
     each = OBJECT + comb(config.object_views, 2) * PAIR * config.rotations / GRID
     plan = dict.fromkeys(numbered("object", objects), each)
-    draws = numbered("draw", len(draws_of(range(objects), config.draws)))
+    draws = numbered("draw", len(rows_of_draws(objects, config.draws)))
     return plan | {f"{draw}, template": FIRST_FIT for draw in draws}, len(draws)
 
 

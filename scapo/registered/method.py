@@ -450,10 +450,15 @@ class TemplateRegistration(AbstractRegistered):
         """By registration and bundle adjustment of the views."""
         kinds, config = self.template.kinds, self.config.discovery
         groups = [] if labels.instance is None else grouped(labels.instance.cpu(), config)
-        objects = [self._observed(observation.points[rows].cpu())[1] for rows in groups]
+        objects = [self._of_one_size(observation.points[rows].cpu()) for rows in groups]
         if labels.instance is not None and not objects:
             logger.warning("too few clouds of any one object: which show the same is not used")
         return discover(learned.views, kinds, config, generator, objects, self.journal)
+
+    def _of_one_size(self, cloud: Float[Tensor, "B N 3"]) -> PartialViews:
+        """Clouds of one object, normalised all alike: it is as large in all of them."""
+        similarity, views, _ = self._observed(cloud)
+        return views.scaled(similarity.scale.median() / similarity.scale)
 
     def _prediction(
         self,

@@ -28,6 +28,7 @@ from scapo.registered.objects import (
 )
 from scapo.registered.pose_search import Hypotheses, voted
 from scapo.registered.template import Placement
+from scapo.registered.view_states import Motion
 from scapo.types import Labels, Observation
 from tests.helpers.sighted import AXIS, sighted
 from tests.helpers.strategies import generator
@@ -48,6 +49,7 @@ def known(turn: torch.Tensor, seed: int, scores: tuple[float, float, float]) -> 
         ),
         moved=(moved,),
         proposals=(sorted(proposals, key=lambda one: -one.score),),
+        motions=(Motion(state=truth.state[:, 0], moved=moved, score=0.3, support=-0.2),),
         centre=torch.zeros(3),
         half=torch.full((3,), 0.3),
     )
