@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """What labelled clouds taught about a model's answers, as a JSON file beside its checkpoint.
 
-`alignment` brings its frames to the category's; `joint` and `part` turn what speaks for an answer
-into the probability that it is right: a logistic map of three numbers whose weights cannot have the
-wrong sign. `reliability` says how true such probabilities were of objects not fitted to.
+`alignment` brings its frames to the category's where the checkpoint does not; `joint` and `part`
+turn what speaks for an answer into the probability that it is right: a logistic map of three
+numbers whose weights cannot have the wrong sign. `reliability` says how true such probabilities
+were of objects not fitted to.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bench.infer.alignment import Alignment
 from bench.requests import Mode
 from bench.twin.record import Twin
+from scapo.alignment import Alignment
 from scapo.store.files import canonical_json, write_bytes
 from scapo.store.json_records import from_json, read_json
 from scapo.store.schema import StoreError
 
-FORMAT = "scapo-calibration/1"
+FORMAT = "scapo-calibration/2"
 FEATURES = ("residual", "margin", "spread")
 SIGNS = (-1.0, 1.0, -1.0)
 """Of the weights: a larger residual or spread cannot speak for an answer."""
@@ -80,7 +81,8 @@ class Calibration:
     data: str
     """Digest of the labelled data."""
     samples: int
-    alignment: Alignment
+    alignment: Alignment | None
+    """None: the checkpoint has one, or learned poses from labels."""
     joint: tuple[LogisticMap, ...]
     """That the direction of each joint's axis is within 5 degrees."""
     part: tuple[LogisticMap, ...]
@@ -108,7 +110,9 @@ def read_calibration(path: Path, digest: str) -> Calibration:
     """
     record = read_json(path)
     if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise StoreError(f"{path}: expected {FORMAT}, found something else")
+        raise StoreError(
+            f"{path}: expected {FORMAT}, found something else: scapo-bench calibrate makes it anew"
+        )
     found: Calibration = from_json(
         Calibration, {k: v for k, v in record.items() if k != "format"}, str(path)
     )

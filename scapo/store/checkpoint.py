@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from scapo.alignment import Alignment
 from scapo.categories import CATEGORIES, Category
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.store.definitions import DEFINITION, defined
@@ -138,6 +139,16 @@ def write_checkpoint(path: Path, module: nn.Module, header: Header) -> str:
     return write(path, to_arrays(module), header)
 
 
+def with_alignment(path: Path, alignment: Alignment) -> str:
+    """Store what brings a method's answers to the object's frame; weights stay bit for bit.
+
+    Returns:
+        The file's new SHA-256.
+    """
+    arrays, header = read_checkpoint(path)
+    return write(path, arrays, {**header, "alignment": asdict(alignment)})
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckpointHeader:
     """What a checkpoint says of itself, as far as anything here reads it."""
@@ -160,6 +171,8 @@ class CheckpointHeader:
     normalisation: dict[str, str | float] = field(default_factory=dict)
     definition: dict[str, Any] | None = None
     """Of a category that the package has not (`definitions`)."""
+    alignment: Alignment | None = None
+    """None: answers are in the method's own frames; so are those of checkpoints of before."""
 
 
 RUN_FIELDS = ("seed", "data_digest", "supervision", "steps", "finished", "versions")
@@ -190,7 +203,12 @@ def check_header(header: object, where: str) -> CheckpointHeader:
         StoreError: As `read_checkpoint`.
     """
     known = from_json(CheckpointHeader, header, where)
-    header_category(known, where)
+    parts = header_category(known, where).parts
+    if known.alignment is not None and len(known.alignment.order) != len(parts):
+        raise StoreError(
+            f"{where}: alignment: expected that of {len(parts)} parts, found "
+            f"{len(known.alignment.order)}"
+        )
     return known
 
 

@@ -62,6 +62,7 @@ def test_confidences_follow_how_often_answers_are_right(told, data, tmp_path, mo
     assert [path.name for path in written] == ["checkpoint.calibration-fast.json", "r.png"]
     assert read_calibration(written[0], "0" * 64) == found
     assert found.samples == COUNT
+    assert found.alignment is not None
     assert found.alignment.order == (0, 1)
     assert found.alignment.sign == (1.0,)
     assert found.alignment.zero[0] == pytest.approx(0, abs=1e-3)
