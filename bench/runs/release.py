@@ -19,10 +19,17 @@ import torch
 from bench.methods import find, load
 from bench.requests import ReleaseRequest
 from bench.scoring.score_files import SUFFIX, Report, read_report
+from bench.tables.model import UNCALIBRATED, UNCALIBRATED_NOTE
 from scapo.method import AbstractMethod, Mode, evenly
 from scapo.predictor import Predictor
 from scapo.store import Header, StoreError, open_split, sha256_file, write, write_bytes
-from scapo.store.checkpoint import RUN_FIELDS, WEIGHTS, require_fields, to_arrays
+from scapo.store.checkpoint import (
+    RUN_FIELDS,
+    WEIGHTS,
+    check_header,
+    require_fields,
+    to_arrays,
+)
 from scapo.store.files import read
 from scapo.store.samples import SampleDataset, observe, observed
 
@@ -67,8 +74,7 @@ segmented from its surroundings. One object of the category, in the units of the
 
 - Trained on procedural shapes: real objects look different (rows `real`, where there are any).
 - Views that several poses explain are answered by one of them; the scores say how often.
-- Without labels in training the frames of the parts are the method's own, up to one rigid offset
-  for each part (`scapo-bench calibrate` learns it from labelled clouds).
+- {frame}
 - Nothing tells whether a cloud shows the category at all. No safety may rest on an answer.
 
 <details><summary>Configuration</summary>
@@ -202,9 +208,28 @@ def card_of(header: Header, request: ReleaseRequest) -> str:
         parameters=header.get("parameters", 0),
         steps=header["steps"],
         commit=header.get("commit", ""),
+        frame=frame_sentence(header),
         labels=", ".join(header["supervision"]) or "none",
         scores=scores_table(header, request.scores),
         config=json.dumps(header["config"], indent=1, sort_keys=True),
+    )
+
+
+def frame_sentence(header: Header) -> str:
+    """In which frame the model answers, and by which labels."""
+    found = check_header(header, "header").alignment
+    if found is not None:
+        numbers = 6 * len(found.order) + len(found.zero)
+        return (
+            "Poses are in the object's frame (z up, the front towards -x) and states 0 at rest by "
+            f"{numbers} numbers,\n  fitted after training with the labels of "
+            f"{found.clouds.samples} clouds of `{found.clouds.split}`; no weight depends on them."
+        )
+    if "pose" in header["supervision"]:
+        return "Poses are in the frames of the training labels."
+    return (
+        "Without labels in training the frames of the parts are the method's own, up to one rigid "
+        "offset\n  for each part (`scapo-bench calibrate` learns it from labelled clouds)."
     )
 
 
@@ -213,7 +238,7 @@ def scores_table(header: Header, scores: Path | None) -> str:
     if scores is None:
         return "Not given."
     rows = [
-        (*_where(report), variant or "fast", trait, summary)
+        (*_where(report), variant or "fast", trait, _numbers(report, summary))
         for report in _reports(header, scores)
         for variant, trait, summary in _summaries(report)
     ]
@@ -221,9 +246,9 @@ def scores_table(header: Header, scores: Path | None) -> str:
         return "None of this run."
     heads = ["data", "split", "variant", "objects", *(metric[0] for metric in METRICS)]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for data, split, variant, trait, summary in sorted(rows, key=lambda row: row[:4]):
-        lines.append(f"| {data} | {split} | {variant} | {trait} | {_numbers(summary)} |")
-    return "\n".join([*lines, "", LEGEND])
+    lines += [f"| {' | '.join(row)} |" for row in sorted(rows)]
+    told = [UNCALIBRATED_NOTE] if any(UNCALIBRATED in line for line in lines) else []
+    return "\n".join([*lines, "", LEGEND, *told])
 
 
 def _where(report: Report) -> tuple[str, str]:
@@ -250,9 +275,10 @@ def _summaries(report: Report) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
         yield report.variant, trait or "as in training", found["summary"]
 
 
-def _numbers(summary: Mapping[str, Any]) -> str:
+def _numbers(report: Report, summary: Mapping[str, Any]) -> str:
     cells = []
     for _, key, factor, decimals in METRICS:
         mean = summary.get(key, {}).get("mean")
-        cells.append("–" if mean is None else f"{factor * mean:.{decimals}f}")
+        mark = UNCALIBRATED * report.lacks_calibration(key.rpartition("_")[0])
+        cells.append("–" if mean is None else f"{factor * mean:.{decimals}f}{mark}")
     return " | ".join(cells)

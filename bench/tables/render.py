@@ -99,6 +99,7 @@ def _values(cell: Cell, seeds: int) -> tuple[object, ...]:
         cell.undefined or "",
         int(cell.best),
         int(cell.flag),
+        int(cell.uncalibrated),
     )
 
 
