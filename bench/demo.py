@@ -58,7 +58,7 @@ class Demo:
     epochs: int = 16
     """Passes over the training clouds in each of the two stages of SCAPO as published."""
     votes: int = 30
-    """Passes of the network of SCAPO by registration, after registration and joint fit."""
+    """Passes of the network of template registration, once its template is found."""
 
     def __post_init__(self) -> None:
         """Take the categories of Table 1 that have released models where none is named."""

@@ -30,9 +30,11 @@ CHECKOUT = Path("results", "checkpoints")
 class Predictor:
     """A trained method, for clouds of one category.
 
-    >>> from scapo.registered.method import RegisteredConfig, RegisteredScapo
+    >>> from scapo.registered.config import RegisteredConfig
+    >>> from scapo.registered.method import TemplateRegistration
     >>> config = RegisteredConfig(points=64, width=8)
-    >>> method = RegisteredScapo(config, CATEGORIES["oven"], torch.Generator())  # `load`: a trained
+    >>> # `load` gives a trained one.
+    >>> method = TemplateRegistration(config, CATEGORIES["oven"], torch.Generator())
     >>> found = Predictor(method, "cpu").predict(np.random.default_rng(0).normal(size=(3, 100, 3)))
     >>> found.part_weight.shape, found.joints.axis.shape, found.camera_T_part.shape
     (torch.Size([3, 100, 2]), torch.Size([3, 1, 3]), torch.Size([3, 2, 4, 4]))

@@ -84,14 +84,14 @@ LIBRARY: dict[str, Method] = {
         },
     ),
     "registered": Method(
-        title="SCAPO, registered",
+        title="Template registration",
         rank=80,
-        maker="scapo.registered.method:RegisteredScapo",
-        presets={"cpu": "scapo.registered.method:cpu_config"},
+        maker="scapo.registered.method:TemplateRegistration",
+        presets={"cpu": "scapo.registered.config:cpu_config"},
         camera=True,
     ),
     "registered-labelled": Method(
-        title="SCAPO, registered, true template",
+        title="Template registration, true template",
         rank=81,
         maker="scapo.registered.labelled:LabelledRegistered",
         presets={"cpu": "scapo.registered.labelled:LabelledConfig"},

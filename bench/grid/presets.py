@@ -111,7 +111,7 @@ REGISTERED = Entry(
 )
 WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=REGISTERED,
              parts=("clean", "sensor"), training=1200, seconds={"fast": 0.01})  # fmt: skip
-"""The paper's networks, begun at what the registration method says: SCAPO, warm start."""
+"""The paper's networks, begun at what template registration says: SCAPO, warm start."""
 GRID = (*NETWORKS, *LABELLED, REGISTERED, WARM, *ABLATIONS)
 
 PRESETS: Mapping[PresetName, Preset] = {

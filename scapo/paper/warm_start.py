@@ -30,7 +30,8 @@ from scapo.paper.first_targets import Lying
 from scapo.paper.objectives import LossConfig
 from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
 from scapo.records import cat, map_tensors, take
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.config import RegisteredConfig
+from scapo.registered.method import TemplateRegistration
 from scapo.store.checkpoint import (
     check_header,
     config_from,
@@ -255,7 +256,7 @@ class WarmStart:
         )
 
 
-def load_run(path: Path, category: Category) -> RegisteredScapo:
+def load_run(path: Path, category: Category) -> TemplateRegistration:
     """The trained model of a `registered` run folder or checkpoint file.
 
     Raises:
@@ -263,13 +264,13 @@ def load_run(path: Path, category: Category) -> RegisteredScapo:
     """
     arrays, header = read_checkpoint(path)
     kind = header_category(check_header(header, str(path)), str(path))
-    if header["method"] != RegisteredScapo.name or kind != category:
+    if header["method"] != TemplateRegistration.name or kind != category:
         raise StoreError(
-            f"{path}: expected a run of {RegisteredScapo.name} on {category.name}, found one of "
-            f"{header['method']} on {kind.name}"
+            f"{path}: expected a run of {TemplateRegistration.name} on {category.name}, "
+            f"found one of {header['method']} on {kind.name}"
         )
     config = config_from(RegisteredConfig, header["config"], f"{path}: config")
-    method = RegisteredScapo(config, kind, torch.Generator())
+    method = TemplateRegistration(config, kind, torch.Generator())
     load_arrays(method, arrays, path)
     return method.eval()
 

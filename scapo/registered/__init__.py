@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The registration method for partial views: `method` is what others take."""
+"""Template registration, the method for partial views: `method` is what others take."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What can be chosen of the search for a category's template (`discovery`)."""
+"""What can be chosen of template registration: the search for the template, and all after it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from scapo.registered.joint_limits import RANGE_COST
 
@@ -73,3 +74,51 @@ class DiscoveryConfig(TemplateConfig):
     """Try whether the axes of hinges deviate from one object to the next."""
     template_points: int = 400
     """Points of the template while it is sought."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SearchConfig:
+    """A template, the network that votes for its placement, and the search at test time."""
+
+    discovery: TemplateConfig = field(default_factory=TemplateConfig)
+    """The template."""
+    learned: int = 600
+    """Training clouds whose placements the network learns, 0.25 s each on one core."""
+    trusted: float = 0.85
+    """Share of those clouds, the most confidently placed, that the network learns from."""
+    epochs: int = 60
+    """Epochs of the network."""
+    lr: float = 1e-3
+    """Learning rate of the network at the beginning; it falls to a hundredth on half a cosine."""
+    batch: int = 32
+    """Clouds of one step of the network's optimiser."""
+    width: int = 48
+    """Width of the network's layers; 48 gives 0.2 million parameters."""
+    points: int = 256
+    """Points of each cloud that the network and the search see."""
+    grid_hypotheses: int = 32
+    """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
+    and were placed in training, half as of images of the template; 0: the network's four."""
+    quick_hypotheses: int = 12
+    """Placements of each cloud that `quick` begins with."""
+    strays: Literal["out", "kept"] = "out"
+    """Whether outliers, points that do not belong to the object, are left out."""
+    settle: bool = True
+    """Try all states again for the placement that won."""
+    camera: Literal["known", "estimated"] = "known"
+    """Whether `quick` and `refine` take the camera from the cloud's frame or from the network."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisteredConfig(SearchConfig):
+    """Template registration: the template by registration and bundle adjustment."""
+
+    discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
+    """The search for the template."""
+    supervision: tuple[Literal["instance"], ...] = ()
+    """What is known of the training clouds: nothing, or which of them show the same object."""
+
+
+def cpu_config() -> RegisteredConfig:
+    """Trains one category in at most 20 minutes on two cores."""
+    return RegisteredConfig()

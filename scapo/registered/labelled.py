@@ -27,9 +27,10 @@ from scapo.categories import JointKind
 from scapo.geometry.points import Similarity, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.records import take
+from scapo.registered.config import SearchConfig
 from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
-from scapo.registered.method import AbstractRegistered, LearnedClouds, SearchConfig
+from scapo.registered.method import AbstractRegistered, LearnedClouds
 from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.pose_search import SearchResult
 from scapo.registered.template import (
@@ -58,7 +59,7 @@ CHUNK = 64  # Views, and as many times 16 points, that are compared at once
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelledConfig(SearchConfig):
-    """SCAPO by registration with the template of true placements."""
+    """Template registration with the template of true placements."""
 
     trusted: float = 1.0
     """Share of the learned clouds, those that the template explains best, that the network learns

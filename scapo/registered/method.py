@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The registration method: SCAPO for partial views, which are registered, fitted and then learned.
+"""Template registration: partial views are registered, fitted together and then learned.
+
+A method of this project's. It shares SCAPO's idea, one articulated template per category, found
+without labels, and none of its networks (docs/registration.md).
 
 Training. Views of the category are registered and fitted together into one articulated template,
 which is then searched for in the training views (`discovery`); a small network (`network`) learns
@@ -18,8 +21,8 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -33,7 +36,7 @@ from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, chan
 from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
-from scapo.registered.config import DiscoveryConfig, TemplateConfig
+from scapo.registered.config import RegisteredConfig, SearchConfig
 from scapo.registered.decode import metric_limits, nearest_weights, placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
@@ -82,54 +85,6 @@ TURN = 0.15
 LAST_RATE = 0.01  # Share of the learning rate at the end
 ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
 FRAMES = 4  # Hypotheses of the network for each cloud, one in each of its principal frames
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SearchConfig:
-    """A template, the network that votes for its placement, and the search at test time."""
-
-    discovery: TemplateConfig = field(default_factory=TemplateConfig)
-    """The template."""
-    learned: int = 600
-    """Training clouds whose placements the network learns, 0.25 s each on one core."""
-    trusted: float = 0.85
-    """Share of those clouds, the most confidently placed, that the network learns from."""
-    epochs: int = 60
-    """Epochs of the network."""
-    lr: float = 1e-3
-    """Learning rate of the network at the beginning; it falls to a hundredth on half a cosine."""
-    batch: int = 32
-    """Clouds of one step of the network's optimiser."""
-    width: int = 48
-    """Width of the network's layers; 48 gives 0.2 million parameters."""
-    points: int = 256
-    """Points of each cloud that the network and the search see."""
-    grid_hypotheses: int = 32
-    """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
-    and were placed in training, half as of images of the template; 0: the network's four."""
-    quick_hypotheses: int = 12
-    """Placements of each cloud that `quick` begins with."""
-    strays: Literal["out", "kept"] = "out"
-    """Whether outliers, points that do not belong to the object, are left out."""
-    settle: bool = True
-    """Try all states again for the placement that won."""
-    camera: Literal["known", "estimated"] = "known"
-    """Whether `quick` and `refine` take the camera from the cloud's frame or from the network."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegisteredConfig(SearchConfig):
-    """SCAPO by registration and bundle adjustment."""
-
-    discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
-    """The search for the template."""
-    supervision: tuple[Literal["instance"], ...] = ()
-    """What is known of the training clouds: nothing, or which of them show the same object."""
-
-
-def cpu_config() -> RegisteredConfig:
-    """Trains one category in at most 20 minutes on two cores."""
-    return RegisteredConfig()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -454,8 +409,8 @@ class AbstractRegistered(AbstractMethod):
         )
 
 
-class RegisteredScapo(AbstractRegistered):
-    """SCAPO for partial views: the template is discovered, without labels of poses or parts."""
+class TemplateRegistration(AbstractRegistered):
+    """Template registration: the template is discovered, without labels of poses or parts."""
 
     name: ClassVar[str] = "registered"
     config: RegisteredConfig

@@ -5,7 +5,8 @@ A cloud is expressed in the four proper frames of its principal axes: the set of
 change when the cloud is turned or moved. In each frame a plain point network says where every
 point lies on the placed template (template axes, this cloud's size and state), how sure it is,
 and which part it belongs to; a weighted Procrustes step turns the votes into a pose. The frame
-whose points are surest wins. Learned towards the placements that search and joint fit found.
+whose points are surest wins. Learned towards the placements that search and
+bundle adjustment found.
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import AbstractMethod, Mode, Stage, Step
 from scapo.predictor import Predictor
 from scapo.records import take
-from scapo.registered.config import DiscoveryConfig
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.decode import nearest_weights, placed_prediction
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.method import TemplateRegistration
 from scapo.registered.template import turn_placement
 from scapo.registered.view_bank import ShownPoints
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
@@ -95,11 +95,11 @@ def told_model(method: Told, calibration: Calibration | None = None) -> Model:
 
 
 @cache
-def placed(category: str = "oven") -> RegisteredScapo:
+def placed(category: str = "oven") -> TemplateRegistration:
     """A registered model with the true template and placements, its network untaught."""
     views, truth = sighted(12, seed=60)
     cloud = views.points - views.camera[:, None]
-    method = RegisteredScapo(CONFIG, CATEGORIES[category], generator(0))
+    method = TemplateRegistration(CONFIG, CATEGORIES[category], generator(0))
     method.template.load_state_dict(template().state_dict())
     camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
     method.pseudo.set(cloud[:, 0], truth, camera, torch.ones(12))

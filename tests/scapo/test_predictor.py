@@ -13,7 +13,8 @@ from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
 from scapo.predictor import Predictor, load, released
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.config import RegisteredConfig
+from scapo.registered.method import TemplateRegistration
 from scapo.registry import LIBRARY
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.store.schema import StoreError
@@ -75,7 +76,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
     config = RegisteredConfig(points=64, width=8)
-    model = RegisteredScapo(config, CATEGORIES["laptop"], generator(0)).eval()
+    model = TemplateRegistration(config, CATEGORIES["laptop"], generator(0)).eval()
     write_checkpoint(
         tmp_path / WEIGHTS, model, checkpoint_header("registered", config, "laptop", {})
     )

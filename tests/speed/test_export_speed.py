@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The network of the registration method beside its graph and its ONNX file, one thread."""
+"""The network of template registration beside its graph and its ONNX file, one thread."""
 
 from __future__ import annotations
 

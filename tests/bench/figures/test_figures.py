@@ -35,7 +35,8 @@ from bench.figures.template import (
 )
 from bench.requests import Request
 from scapo.categories import category
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.config import RegisteredConfig
+from scapo.registered.method import TemplateRegistration
 from scapo.registered.template import Placement
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.store.predictions import write_predictions
@@ -183,7 +184,7 @@ def test_templates_of_both_methods() -> None:
     assert shape.points.shape == (64, 3)
     np.testing.assert_allclose(shape.weight.sum(1), 1, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(shape.axis, axis=1), 1, atol=1e-5)
-    method = RegisteredScapo(RegisteredConfig(), category("laptop"), generator(0))
+    method = TemplateRegistration(RegisteredConfig(), category("laptop"), generator(0))
     points = torch.randn(30, 3, generator=generator(1))
     normals = torch.nn.functional.normalize(points, dim=-1)
     method.template.assign(points, normals, torch.stack([points[:, 2], -points[:, 2]], 1) * 9)
@@ -198,7 +199,7 @@ def test_templates_of_both_methods() -> None:
 
 @torch.no_grad()
 def test_a_template_whose_hinges_lean_is_drawn_from_their_rest() -> None:
-    method = RegisteredScapo(RegisteredConfig(), category("laptop"), generator(0))
+    method = TemplateRegistration(RegisteredConfig(), category("laptop"), generator(0))
     template, g = method.template, generator(1)
     for tensor in (template.points, template.logit, template.axis, template.pivot):
         tensor.copy_(torch.randn(tensor.shape, generator=g))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The network of the registration method answers alike as a graph and as an ONNX file."""
+"""The network of template registration answers alike as a graph and as an ONNX file."""
 
 from __future__ import annotations
 

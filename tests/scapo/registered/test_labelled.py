@@ -15,9 +15,9 @@ from scapo.geometry.points import normalise, squared_distances
 from scapo.geometry.rigid import axis_angle, point_line_distance, rotation_angle
 from scapo.method import Step
 from scapo.records import take
-from scapo.registered.config import DiscoveryConfig, TemplateConfig
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig, TemplateConfig
 from scapo.registered.labelled import LabelledConfig, LabelledRegistered
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.method import TemplateRegistration
 from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_loss import view_loss
@@ -174,11 +174,11 @@ def test_labels_change_nothing_where_they_are_not_declared() -> None:
         one = method.losses(some, labels, step)
         other = method.losses(some, Labels(), replace(step, generator=generator(2)))
     assert {k: float(v) for k, v in one.items()} == {k: float(v) for k, v in other.items()}
-    bare = RegisteredScapo(RegisteredConfig(), CATEGORIES["oven"], generator(0))
+    bare = TemplateRegistration(RegisteredConfig(), CATEGORIES["oven"], generator(0))
     assert bare.supervision == frozenset()
     assert SEEN.labels.keep(bare.supervision) == Labels()
     config = RegisteredConfig(supervision=("instance",))
-    told = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    told = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
     assert SEEN.labels.keep(told.supervision) == Labels(instance=SEEN.labels.instance)
     assert told.variant == "objects known"
     assert not bare.variant
@@ -199,7 +199,7 @@ def test_the_bound_explains_the_views_at_least_as_well_as_what_is_discovered() -
         judged=4, template_points=120, final_points=300, mirror=False, leans=False,
     )  # fmt: skip
     config = RegisteredConfig(discovery=discovery, points=128, width=8, epochs=1)
-    found = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    found = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
     found.start("votes", seen.observation, Labels(), generator(1))
     views = views_of(seen)
     bound = started(seen)

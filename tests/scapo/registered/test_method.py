@@ -14,8 +14,8 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.points import squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Mode, Step
-from scapo.registered.config import DiscoveryConfig
-from scapo.registered.method import RegisteredConfig, RegisteredScapo, cpu_config
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config
+from scapo.registered.method import TemplateRegistration
 from scapo.registered.view_bank import ShownPoints
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.sighted import sighted, template
@@ -27,13 +27,13 @@ def at(progress: float, index: Tensor, g: torch.Generator) -> Step:
     return Step(stage="votes", progress=progress, generator=g, index=index, total=12)
 
 
-def trained(steps: int = 30) -> tuple[RegisteredScapo, Observation]:
+def trained(steps: int = 30) -> tuple[TemplateRegistration, Observation]:
     """The method with the true template and placements of 12 clouds, its network taught a bit."""
     views, truth = sighted(12, seed=60)
     cloud = views.points - views.camera[:, None]  # the camera at the origin
     discovery = DiscoveryConfig(final_points=400)
     config = RegisteredConfig(points=128, width=16, batch=12, discovery=discovery)
-    method = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    method = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
     method.template.load_state_dict(template().state_dict())
     camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
     method.pseudo.set(cloud[:, 0], truth, camera, torch.ones(12))
@@ -63,7 +63,7 @@ def test_predictions_turn_and_move_with_the_cloud_and_survive_storage():
         turned.camera_T_part[:, 0, :3, :3], turn @ plain.camera_T_part[:, 0, :3, :3]
     )
     assert angles.rad2deg().median() < 1
-    other = RegisteredScapo(method.config, method.category, generator(5))
+    other = TemplateRegistration(method.config, method.category, generator(5))
     other.load_state_dict(method.state_dict())
     again = other.eval().predict(observation)
     assert_close(again.part_weight, plain.part_weight)
@@ -122,14 +122,14 @@ def test_what_is_drawn_once_follows_the_template():
 
 def test_the_first_weights_come_from_the_seed_alone():
     one, other = (
-        RegisteredScapo(RegisteredConfig(), CATEGORIES["oven"], generator(4)) for _ in range(2)
+        TemplateRegistration(RegisteredConfig(), CATEGORIES["oven"], generator(4)) for _ in range(2)
     )
     assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
 
 
 def test_one_stage_over_the_clouds_that_were_placed():
     config = RegisteredConfig(epochs=3, learned=20)
-    made = RegisteredScapo(config, CATEGORIES["drawer"], generator(0))
+    made = TemplateRegistration(config, CATEGORIES["drawer"], generator(0))
     (stage,) = made.stages()
     assert (stage.name, stage.epochs, stage.clouds) == ("votes", 3, 20)
     assert made.variant == ""
@@ -180,7 +180,7 @@ def test_a_batch_is_told_by_its_samples_alone():
 
 def test_of_many_clouds_only_the_learned_ones_have_placements():
     method, observation = trained(0)
-    few = RegisteredScapo(replace(method.config, learned=3), method.category, generator(0))
+    few = TemplateRegistration(replace(method.config, learned=3), method.category, generator(0))
     few.load_state_dict(method.state_dict())  # of 12 clouds, 0, 5 and 11 are learned
     row = torch.tensor([11, 0])
     batch = Observation(points=observation.points[row])
@@ -190,7 +190,7 @@ def test_of_many_clouds_only_the_learned_ones_have_placements():
 
 
 def variant(config: RegisteredConfig) -> str:
-    return RegisteredScapo(config, CATEGORIES["oven"], generator(0)).variant
+    return TemplateRegistration(config, CATEGORIES["oven"], generator(0)).variant
 
 
 def test_departures_are_named_and_a_shorter_training_is_not() -> None:

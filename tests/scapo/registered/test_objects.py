@@ -12,10 +12,10 @@ import torch
 from scapo.categories import CATEGORIES
 from scapo.geometry.rigid import axis_angle, random_rotations, rotation_angle
 from scapo.registered import method
-from scapo.registered.config import DiscoveryConfig
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.joint_proposals import JointProposal, PosedViews
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.method import TemplateRegistration
 from scapo.registered.objects import (
     OneObject,
     agreeing,
@@ -100,7 +100,7 @@ def test_clouds_are_grouped_where_each_object_shows_enough(
 
     monkeypatch.setattr(method, "discover", discovering)
     config = RegisteredConfig(supervision=("instance",), points=32)
-    registered = RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+    registered = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
     points = torch.randn(4 * each, 64, 3, generator=generator(1)) + torch.tensor([0.0, 0, 9])
     labels = Labels(instance=torch.arange(4).repeat(each))
     with pytest.raises(InterruptedError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The whole training of SCAPO as it works, on a few views: it repeats, resumes and predicts."""
+"""The whole training of template registration, on a few views: it repeats, resumes and predicts."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import torch
 
 from scapo.categories import CATEGORIES
 from scapo.predictor import load
-from scapo.registered.config import DiscoveryConfig
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.discovery import discover
-from scapo.registered.method import RegisteredConfig, RegisteredScapo
+from scapo.registered.method import TemplateRegistration
 from scapo.store.samples import TrainingData
 from scapo.training import fit
 from scapo.types import Labels, Observation
@@ -43,8 +43,8 @@ def clouds(count: int) -> Observation:
     return Observation(points=views.points - views.camera[:, None])
 
 
-def method(config: RegisteredConfig = CONFIG) -> RegisteredScapo:
-    return RegisteredScapo(config, CATEGORIES["oven"], generator(0))
+def method(config: RegisteredConfig = CONFIG) -> TemplateRegistration:
+    return TemplateRegistration(config, CATEGORIES["oven"], generator(0))
 
 
 @pytest.mark.slow
@@ -58,7 +58,7 @@ def test_a_template_is_found_learned_and_stored(tmp_path: Path) -> None:
 
     fit.fit(method(), data, tmp_path / "whole", RUN, listener=listener)
     found = load(tmp_path / "whole")
-    assert isinstance(found.model, RegisteredScapo)
+    assert isinstance(found.model, TemplateRegistration)
     template = found.model.template
     assert (template.logit.argmax(-1) == 1).float().mean() > 0.1
     assert found.model.pseudo.rotation.shape == (20, 3, 3)
