@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import torch
 
 from bench.methods import find, load
 from bench.requests import ReleaseRequest
+from bench.runs.align import CLOUDS, MODE, aligned
 from bench.scoring.score_files import SUFFIX, Report, read_report
 from bench.tables.model import UNCALIBRATED, UNCALIBRATED_NOTE
 from scapo.method import AbstractMethod, Mode, evenly
@@ -39,6 +40,7 @@ ANSWERS = 10
 """Clouds whose answers are kept."""
 MODES: tuple[Mode, ...] = ("fast", "quick")
 """Whose answers are kept."""
+LABELLED_SPLIT = "train"
 CHECKS = "checks"
 """Folder of the answers, beside that of the checkpoints."""
 FORMAT = "scapo-answers/1"
@@ -107,6 +109,7 @@ def release(request: ReleaseRequest) -> list[Path]:
     require_fields(header, RUN_FIELDS, request.checkpoint)
     if not header["finished"]:
         raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
+    header = {**header, **frame_of_before(method, header, request)}
     source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
     slim(method, request.out, {**header, "source": sha256_file(source)})
     card = request.out.with_suffix(".md")
@@ -114,6 +117,22 @@ def release(request: ReleaseRequest) -> list[Path]:
     answers = answers_file(request.out)
     keep_answers(request, header["category"], answers)
     return [request.out, card, answers]
+
+
+def frame_of_before(
+    method: AbstractMethod, header: Header, request: ReleaseRequest
+) -> dict[str, Any]:
+    """The alignment of a run that was trained before runs had one, by its own training data."""
+    if "pose" in method.supervision or header.get("alignment") is not None:
+        return {}
+    try:
+        split = open_split(request.data, header["category"], LABELLED_SPLIT)
+    except StoreError:
+        return {}
+    if split.manifest.digest != header["data_digest"]:
+        return {}
+    found = aligned(method, split, CLOUDS, MODE, "cpu")
+    return {} if found is None else {"alignment": asdict(found)}
 
 
 def slim(method: AbstractMethod, out: Path, header: Header) -> None:
@@ -187,7 +206,8 @@ def compare_answers(checkpoint: Path) -> dict[str, Differences]:
 
 def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[str, np.ndarray]]]:
     """The answers of each mode, float32."""
-    model = Predictor(load(checkpoint)[0], "cpu")
+    method, header = load(checkpoint)
+    model = Predictor(method, "cpu", check_header(header, str(checkpoint)).alignment)
     for mode in MODES:
         with torch.no_grad():
             said = model.predict(points, mode)
