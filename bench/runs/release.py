@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from scapo.store import Header, StoreError, open_split, sha256_file, write, writ
 from scapo.store.checkpoint import (
     RUN_FIELDS,
     WEIGHTS,
+    alignment_field,
     check_header,
     require_fields,
     to_arrays,
@@ -132,7 +133,7 @@ def frame_of_before(
     if split.manifest.digest != header["data_digest"]:
         return {}
     found = aligned(method, split, CLOUDS, MODE, "cpu")
-    return {} if found is None else {"alignment": asdict(found)}
+    return {} if found is None else alignment_field(found)
 
 
 def slim(method: AbstractMethod, out: Path, header: Header) -> None:

@@ -8,6 +8,7 @@ file so that a killed run can never pair the weights of one step with the state 
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, is_dataclass
@@ -22,7 +23,7 @@ from scapo.alignment import Alignment
 from scapo.categories import CATEGORIES, Category
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.store.definitions import DEFINITION, defined
-from scapo.store.files import CHECKPOINT, Arrays, Header, read, write
+from scapo.store.files import CHECKPOINT, Arrays, Header, canonical_json, read, write
 from scapo.store.json_records import StoreError, from_json
 from scapo.types import Supervision
 
@@ -146,7 +147,12 @@ def with_alignment(path: Path, alignment: Alignment) -> str:
         The file's new SHA-256.
     """
     arrays, header = read_checkpoint(path)
-    return write(path, arrays, {**header, "alignment": asdict(alignment)})
+    return write(path, arrays, {**header, **alignment_field(alignment)})
+
+
+def alignment_field(alignment: Alignment) -> Header:
+    """What a header says of an alignment, as JSON has it."""
+    return {"alignment": json.loads(canonical_json(asdict(alignment)))}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
