@@ -247,6 +247,12 @@ class Predictions:
         """Samples without an answer so far, by tensor."""
         self._count = split.manifest.count
         self._parts = len(split.manifest.parts)
+        frame = self.header.object_frame
+        if frame is not None and len(frame.order) not in (0, self._parts):
+            raise StoreError(
+                f"{path}: header field 'object_frame': order: expected that of {self._parts} "
+                f"parts, found {frame.order}"
+            )
         self._file = safe_open(path, "numpy")
         self._slices = check_tensors(str(path), self._file.__enter__(), split)
 

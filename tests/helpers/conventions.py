@@ -50,8 +50,8 @@ def true_answers(category: Category, count: int, rng: np.random.Generator) -> Pr
     pivot, state = rng.normal(size=(count, joints, 3)), rng.uniform(0.2, 1, (count, joints))
     poses = [torch.as_tensor(np.stack([pose(rng) for _ in range(count)]))]
     for j, spec in enumerate(category.joints):
-        given = (torch.as_tensor(x[:, j]) for x in (pivot, axis, state))
-        poses.append(joint_motion(*given, spec.kind) @ poses[0])
+        at, along, by = (torch.as_tensor(x[:, j]) for x in (pivot, axis, state))
+        poses.append(joint_motion(at, along, by, spec.kind) @ poses[0])
     part = torch.as_tensor(rng.integers(0, parts, (count, points)))
     normals = rng.normal(size=(count, points, 3))
     limits = torch.tensor([0.0, 1.2], dtype=torch.float64).expand(count, joints, 2)
