@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import exp, log, log1p
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,7 +25,7 @@ from scapo.store.files import canonical_json, write_bytes
 from scapo.store.json_records import from_json, read_json
 from scapo.store.schema import StoreError
 
-FORMAT = "scapo-calibration/2"
+FORMAT, OF_BEFORE = "scapo-calibration/2", "scapo-calibration/1"
 FEATURES = ("residual", "margin", "spread")
 SIGNS = (-1.0, 1.0, -1.0)
 """Of the weights: a larger residual or spread cannot speak for an answer."""
@@ -109,10 +110,12 @@ def read_calibration(path: Path, digest: str) -> Calibration:
         StoreError: Of another checkpoint, or no calibration.
     """
     record = read_json(path)
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
+    if not isinstance(record, dict) or record.get("format") not in (FORMAT, OF_BEFORE):
         raise StoreError(
             f"{path}: expected {FORMAT}, found something else: scapo-bench calibrate makes it anew"
         )
+    if record["format"] == OF_BEFORE:
+        record = {**record, "alignment": _of_before(record)}
     found: Calibration = from_json(
         Calibration, {k: v for k, v in record.items() if k != "format"}, str(path)
     )
@@ -122,6 +125,19 @@ def read_calibration(path: Path, digest: str) -> Calibration:
             f"that of {found.model[:12]}: scapo-bench calibrate makes it anew"
         )
     return found
+
+
+def _of_before(record: dict[str, Any]) -> object:
+    """The alignment of a file of before: one offset, of the base, from which joints move the rest.
+
+    Here children follow the base too (`bench.infer.parts`), so that it may stand for every part.
+    """
+    known = record.get("alignment")
+    if not isinstance(known, dict) or not isinstance(known.get("order"), list):
+        return known
+    clouds = {"split": record.get("split"), "data_digest": record.get("data"),
+              "samples": record.get("samples"), "mode": record.get("mode")}  # fmt: skip
+    return {**known, "own_T_part": [known.get("base")] * len(known["order"]), "clouds": clouds}
 
 
 def feature(evidence: Mapping[str, float], kind: str, index: int) -> tuple[float, ...] | None:

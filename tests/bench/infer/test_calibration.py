@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -107,4 +108,24 @@ def test_it_is_read_as_written_and_belongs_to_one_checkpoint(tmp_path):
         read_calibration(path, "b" * 64)
     path.write_text("{}")
     with pytest.raises(StoreError, match="expected scapo-calibration/2"):
+        read_calibration(path, "a" * 64)
+
+
+def test_files_of_before_are_read_their_one_offset_for_every_part(tmp_path):
+    path = calibration_file(tmp_path / "checkpoint.safetensors", "quick")
+    write_calibration(path, calibration())
+    record = json.loads(path.read_text())
+    base = np.eye(4)
+    base[:3, 3] = [0.1, 0.2, 0.3]
+    record["format"] = "scapo-calibration/1"
+    record["alignment"] = {"order": [1, 0], "base": base.tolist(), "sign": [-1.0], "zero": [0.5]}
+    path.write_text(json.dumps(record))
+    found = read_calibration(path, "a" * 64)
+    assert found.alignment is not None
+    assert (found.alignment.order, found.alignment.sign) == ((1, 0), (-1.0,))
+    np.testing.assert_array_equal(found.alignment.own_T_part, [base, base])
+    assert found.alignment.clouds.samples == 30
+    record["alignment"] = {"order": 3}
+    path.write_text(json.dumps(record))
+    with pytest.raises(StoreError, match="alignment"):
         read_calibration(path, "a" * 64)
