@@ -123,14 +123,14 @@ def test_an_alignment_is_stored_without_a_change_to_the_weights(tmp_path: Path) 
     ],
 )
 def test_damaged_alignments_are_refused(change: dict[str, object], message: str) -> None:
-    header = checkpoint.checkpoint_header("scapo", TINY, "laptop", {})
+    header = {"method": "scapo", "category": "laptop", "config": {}}
     field = checkpoint.alignment_field(Alignment.of_order((1, 0), CLOUDS))
     with pytest.raises(StoreError, match=message):
         checkpoint.check_header({**header, "alignment": {**field["alignment"], **change}}, "x")
 
 
 def test_an_alignment_of_other_parts_is_refused() -> None:
-    header = checkpoint.checkpoint_header("scapo", TINY, "laptop", {})
+    header = {"method": "scapo", "category": "laptop", "config": {}}
     field = checkpoint.alignment_field(Alignment.of_order((0, 2, 1), CLOUDS))
     with pytest.raises(StoreError, match="x: alignment: expected that of 2 parts, found 3"):
         checkpoint.check_header({**header, **field}, "x")
