@@ -117,10 +117,15 @@ class Predictor:
             sensor=centre,
         )
         prediction = self.model.predict(observation, mode)
-        if self.alignment is not None and not own_frame:
-            unit = unit_length(observation.points)
-            prediction = self.alignment.apply(prediction, unit, self.model.category)
+        if not own_frame:
+            prediction = self._in_object_frame(prediction, observation)
         return map_tensors(prediction, lambda one: one.reshape((*shape, *one.shape[1:])).cpu())
+
+    def _in_object_frame(self, prediction: Prediction, observation: Observation) -> Prediction:
+        if self.alignment is None:
+            return prediction
+        unit = unit_length(observation.points)
+        return self.alignment.apply(prediction, unit, self.model.category)
 
     def _tensor(self, values: np.ndarray | Tensor) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)

@@ -74,11 +74,10 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
     split = open_split(request.data, model.category.name, request.split)
     labelled = _labelled(split, request.limit)
     clouds = [Cloud(points=points) for points in labelled.points]
-    alignment = None
-    if not model.predictor.in_object_frame:
-        alignment = _aligned(model, split, request)
-        predictor = Predictor(model.predictor.model, model.predictor.device, alignment)
-        model = replace(model, predictor=predictor)
+    alignment = _aligned(model, split, request)
+    if alignment is not None:
+        asked = model.predictor
+        model = replace(model, predictor=Predictor(asked.model, asked.device, alignment))
     found = Calibration(
         model=model.digest,
         mode=request.mode,
@@ -115,13 +114,17 @@ def _whole(cloud: Cloud, model: Model, request: CalibrateRequest) -> Twin:
     return agreement(cloud, ask("", cloud, model, request.mode), model, request.mode)
 
 
-def _aligned(model: Model, split: Split, request: CalibrateRequest) -> Alignment:
+def _aligned(model: Model, split: Split, request: CalibrateRequest) -> Alignment | None:
     """What brings the model's answers to the object's frame, fitted on the same clouds.
+
+    None where they are in it already.
 
     Raises:
         StoreError: Too few have labels and an answer.
     """
     asked = model.predictor
+    if asked.in_object_frame:
+        return None
     found = aligned(asked.model, split, request.limit, request.mode, asked.device)
     if found is None:
         raise StoreError(
