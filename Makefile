@@ -11,6 +11,8 @@ ARGS ?=
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export LP_NUM_THREADS ?= 1
+# Tests start more than a hundred processes: without bytecode each would compile all of our sources.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help setup vulkan demo demo-train test test-quick coverage fuzz lint format bench docs lock dist clean

@@ -7,9 +7,9 @@ Methods that can be given labels at test time, such as ICP with true parts: decl
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -20,6 +20,43 @@ from scapo.pictures import PictureData
 from scapo.types import Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "quick", "refine"]
+T = TypeVar("T")
+
+
+class Journal:
+    """What a `start` that takes minutes tells of itself, and keeps in case it is interrupted.
+
+    This one does neither. Training puts one that does in its place (`training.journal`).
+    """
+
+    def tell(self, words: str, done: float, left: float) -> None:
+        """What begins now.
+
+        Args:
+            words: What it is.
+            done: Share of the start that is over, in [0, 1].
+            left: Seconds that the rest will take, by estimate.
+        """
+
+    def once(
+        self,
+        name: str,
+        make: Callable[[], T],
+        generator: torch.Generator,
+        makers: Mapping[str, Callable[..., Any]],
+    ) -> T:
+        """What `make` returns, or what it returned before the start was interrupted.
+
+        Steps come in the same order with the same names each time, and draw from `generator` alone.
+
+        Args:
+            name: Of the step, no two alike.
+            make: Does it.
+            generator: Afterwards as it was after the step.
+            makers: What makes each kind of record that a step may return (`records.unpack`).
+        """
+        del name, generator, makers
+        return make()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -162,6 +199,8 @@ class AbstractMethod(nn.Module, ABC):
     """A frozen dataclass; stored in checkpoints."""
     category: Category
     supervision: frozenset[Supervision]
+    journal: Journal = Journal()
+    """Of the `start` that is going on."""
 
     @property
     @abstractmethod
@@ -179,7 +218,8 @@ class AbstractMethod(nn.Module, ABC):
         """Prepare a stage from the whole training split, such as a template from its medoid.
 
         Called once at the beginning of each stage, not again on resume: what it sets must be
-        in the state dict. A method without stages is called once, with stage "".
+        in the state dict. A method without stages is called once, with stage "". One that takes
+        long tells `self.journal` how far it is, and has it keep what each of its steps made.
 
         Args:
             stage: Its name.

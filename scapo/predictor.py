@@ -18,6 +18,7 @@ from scapo.records import map_tensors
 from scapo.registry import load_method
 from scapo.store.checkpoint import check_header
 from scapo.store.schema import StoreError
+from scapo.text import did_you_mean
 from scapo.types import Observation, Prediction
 
 RELEASED = "weights"
@@ -163,7 +164,7 @@ def find(path_or_category: str | Path) -> Path:
     known = ", ".join(weights) or "none yet"
     raise StoreError(
         f"{path_or_category}: expected a run folder, a checkpoint or a category with released "
-        f"weights ({known}), found none"
+        f"weights ({known}), found none{did_you_mean(str(path_or_category), weights)}"
     )
 
 

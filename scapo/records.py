@@ -6,12 +6,12 @@ Records within records, tuples and mappings are followed; None and what is no te
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 T = TypeVar("T")
 
@@ -61,3 +61,91 @@ def _combined(values: Sequence[Any], join: Callable[[Sequence[Tensor]], Tensor])
         changed = {n: _combined([getattr(value, n) for value in values], join) for n in names}
         return replace(cast("Any", first), **changed)
     return first
+
+
+def pack(record: object, makers: Container[str]) -> tuple[Any, dict[str, Tensor]]:
+    """A record as JSON and flat tensors, for storage; `unpack` is the inverse.
+
+    Lists, modules and numbers may be in it too. Tensors keep their strides, by which sums and
+    products of equal numbers can differ in the last bit.
+
+    Args:
+        record: Whatever is to be stored.
+        makers: Names of the records and modules that `unpack` can make.
+
+    Raises:
+        TypeError: There is something else in it.
+    """
+    tensors: dict[str, Tensor] = {}
+    return _packed(record, makers, tensors), tensors
+
+
+def _packed(value: Any, makers: Container[str], tensors: dict[str, Tensor]) -> Any:  # noqa: ANN401 - whatever a record holds
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return {"float": value.hex()}
+    if isinstance(value, Tensor):
+        name = f"tensor/{len(tensors)}"
+        size, stride = list(value.shape), list(value.stride())
+        tensors[name] = value.detach().as_strided((_extent(size, stride),), (1,)).clone()
+        return {"tensor": name, "size": size, "stride": stride}
+    if isinstance(value, list | tuple):
+        kind = "list" if isinstance(value, list) else "tuple"
+        items = cast("Sequence[Any]", value)
+        return {kind: [_packed(item, makers, tensors) for item in items]}
+    kind = type(value).__name__
+    if kind not in makers:
+        raise TypeError(f"records: expected one that can be made again, found {kind}")
+    if isinstance(value, nn.Module):
+        held: dict[str, Any] = value.state_dict()
+    else:
+        held = {item.name: getattr(value, item.name) for item in fields(value) if item.init}
+    return {"record": kind, "fields": {n: _packed(x, makers, tensors) for n, x in held.items()}}
+
+
+def unpack(
+    tree: Any,  # noqa: ANN401 - JSON
+    tensors: Mapping[str, Tensor],
+    makers: Mapping[str, Callable[..., Any]],
+) -> Any:  # noqa: ANN401 - whatever was packed
+    """What `pack` was given.
+
+    Args:
+        tree: As `pack` returned it.
+        tensors: Likewise.
+        makers: For each kind of record and module that may be in it what makes one, called with
+            its fields, or the tensors of its state; nothing else is called.
+
+    Raises:
+        LookupError: A tensor or a maker that is not there.
+        ValueError: No such tree, or a tensor of another size.
+
+    >>> from scapo.types import Observation
+    >>> makers = {"Observation": Observation}
+    >>> tree, tensors = pack([Observation(points=torch.eye(3)), 0.1], makers)
+    >>> unpack(tree, tensors, makers)[0].points.trace(), tree["list"][1]
+    (tensor(3.), {'float': '0x1.999999999999ap-4'})
+    """
+    if not isinstance(tree, dict):
+        return tree
+    node = cast("dict[str, Any]", tree)
+    if "tensor" in node:
+        flat, size, stride = tensors[node["tensor"]], node["size"], node["stride"]
+        if len(size) != len(stride) or flat.shape != (_extent(size, stride),):
+            raise ValueError(f"expected a tensor of size {size}, found {tuple(flat.shape)}")
+        return flat.as_strided(size, stride)
+    if "record" in node:
+        held = {name: unpack(item, tensors, makers) for name, item in node["fields"].items()}
+        return makers[node["record"]](**held)
+    if "float" in node:
+        return float.fromhex(node["float"])
+    items = [unpack(item, tensors, makers) for item in node["list" if "list" in node else "tuple"]]
+    return items if "list" in node else tuple(items)
+
+
+def _extent(size: Sequence[int], stride: Sequence[int]) -> int:
+    """Numbers of storage that a tensor reaches over."""
+    if 0 in size:
+        return 0
+    return 1 + sum((many - 1) * step for many, step in zip(size, stride, strict=True))

@@ -47,6 +47,13 @@ def update_golden(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--update-golden"))
 
 
+@pytest.fixture
+def shapes_checked(request: pytest.FixtureRequest) -> None:
+    """For tests of what the checker refuses: skipped where it is off, as in `make coverage`."""
+    if not request.config.getoption("--jaxtyping-packages"):
+        pytest.skip("shapes are unchecked in this run")
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add `--update-golden`."""
     parser.addoption("--update-golden", action="store_true", help="write tests/golden anew")

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -76,7 +78,7 @@ def place(page, tmp_path_factory) -> Path:
     for number in range(2):
         write_fridge(place / "MODELS" / f"f{number}", number)
     (place / "mine.toml").write_text(block(page, "toml"))
-    names = {"MODELS", "DATA", "RUN", "SCORES", "TABLES"}
+    names = {"MODELS", "DATA", "RUN", "SCORES", "TABLES", "OUT"}
     for line in block(page, "sh").splitlines():
         if not line:
             continue
@@ -106,6 +108,10 @@ def test_every_command_of_the_page_ends_well_without_the_file(place):
     assert "Fridge (clean)" in (place / "TABLES" / "table4.md").read_text()
     assert "Fridge (clean)" in (place / "TABLES" / "table7.md").read_text()
     assert (place / "fridges.png").stat().st_size > 1000
+    twin = place / "OUT" / "0000"
+    assert json.loads((twin / "joints.json").read_text())["joints"][0]["child"] == "door"
+    robot = ElementTree.parse(twin / "object" / "mobility.urdf").getroot()
+    assert [link.get("name") for link in robot.iter("link")] == ["body", "door"]
 
 
 def test_data_runs_and_predictions_carry_the_definition(place):

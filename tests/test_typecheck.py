@@ -25,9 +25,8 @@ def test_arguments_and_results_of_another_shape_are_refused():
     rows(torch.zeros(0, 3))
 
 
-def test_the_functions_of_the_packages_are_checked(pytestconfig: pytest.Config):
-    if not pytestconfig.getoption("--jaxtyping-packages"):
-        pytest.skip("shapes are unchecked in this run")
+@pytest.mark.usefixtures("shapes_checked")
+def test_the_functions_of_the_packages_are_checked():
     with pytest.raises(TypeCheckError):
         apply(torch.eye(3), torch.zeros(5, 3))
 

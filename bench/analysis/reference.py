@@ -23,6 +23,7 @@ from bench.scoring.truth import Truth, blocks, revolute
 from scapo.geometry import rigid as geometry
 from scapo.store import Arrays, Split, open_split
 from scapo.store.definitions import foreign, known_category
+from scapo.store.files import require_suffix
 from scapo.store.predictions import Header, write_predictions
 
 RECIPE = "scapo-reference/1"
@@ -54,8 +55,9 @@ def write_reference(
     """Write the predictions file of a reference for a split, learned on the split `train`.
 
     Raises:
-        StoreError: No such data.
+        StoreError: No such data, or a file of another suffix to write.
     """
+    require_suffix(out, ".safetensors")
     test = open_split(data, category, split)
     train = training_split(test) or open_split(data, category, "train")
     write_answers(kind, train, test, out)

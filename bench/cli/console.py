@@ -7,6 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from rich.console import Console
@@ -15,6 +16,7 @@ from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
+    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -45,32 +47,82 @@ def watched(console: Console, what: str) -> Callable[[Sequence[Item]], Iterable[
     return lambda items: track(items, description=what, console=console)
 
 
+BAR = 16  # Characters: with the words of a step a bar fits a line of 80
+LINE_EVERY = 30.0
+"""Seconds between two lines of progress, at least, where the console is no terminal."""
+
+
 @contextmanager
 def stage_bars(console: Console) -> Iterator[Callable[[Position], None]]:
-    """A listener of a training: one bar per stage, none before the first step."""
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>5.1f} %  loss {task.fields[loss]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
-    tasks: dict[str, TaskID] = {}
+    """A listener of a training: one bar per stage and per start that tells of itself.
 
-    def show(step: Position) -> None:
-        name = step.stage.name
-        if name not in tasks:
-            progress.start()
-            tasks[name] = progress.add_task(escape(one_line(name, 60)), total=1.0, loss="")
-        loss = "" if step.loss is None else f"{step.loss:.4f}"
-        progress.update(tasks[name], completed=step.done, loss=loss)
-
+    Where the console is no terminal, a line now and then, and the bars as they are at the end.
+    """
+    bars = _StageBars(console)
     try:
-        yield show
+        yield bars.show
     finally:
-        if tasks:
-            progress.stop()
+        if bars.tasks:
+            bars.progress.stop()
+
+
+class _StageBars:
+    """The bars of one training, and when the last line was said."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=BAR),
+            TextColumn("{task.percentage:>5.1f} %{task.fields[loss]}"),
+            TimeElapsedColumn(),
+            _TimeLeft(),
+            console=console,
+        )
+        self.tasks: dict[tuple[str, bool], TaskID] = {}
+        self.said, self.began = -LINE_EVERY, (0.0, 0.0)
+        """When a line was said, and when this bar began, at which share."""
+
+    def show(self, step: Position) -> None:
+        """What a training says of itself."""
+        name, starting, now = one_line(step.stage.name, 60), bool(step.step), time.monotonic()
+        key, words = (name, starting), f"{name}: {one_line(step.step, 60)}" if starting else name
+        if key not in self.tasks:
+            self.progress.start()
+            for (before, start), task in self.tasks.items():  # what was before is over
+                done = escape(f"{before}: start" if start else before)
+                self.progress.update(task, completed=1.0, description=done)
+            self.tasks[key] = self.progress.add_task(escape(words), total=1.0, loss="", due=None)
+            self.began = now, step.done
+        loss = "" if step.loss is None else f"  loss {step.loss:.4f}"
+        due = None if step.left is None else now + step.left
+        self.progress.update(
+            self.tasks[key], completed=step.done, description=escape(words), loss=loss, due=due
+        )
+        if not self.console.is_terminal and now - self.said >= LINE_EVERY:
+            self.said, left = now, self._left(now, step)
+            share = f"{100 * step.done:.0f} %{' of the start' if starting else loss}"
+            shown = "" if left is None else f", about {clock(left)} left"
+            say(self.console, f"{words}, {share}{shown}")
+
+    def _left(self, now: float, step: Position) -> float | None:
+        """Seconds that the stage or its start will still take, by what it says or by its pace."""
+        began, first = self.began
+        if step.left is not None or step.done <= first:
+            return step.left
+        return (now - began) * (1 - step.done) / (step.done - first)
+
+
+class _TimeLeft(TimeRemainingColumn):
+    """The time left: to the moment at which the task is due, or by its pace."""
+
+    def render(self, task: Task) -> Text:
+        """Hours, minutes and seconds."""
+        due = task.fields["due"]
+        if due is None or task.finished:
+            return super().render(task)
+        seconds = max(0, round(due - time.monotonic()))
+        return Text(str(timedelta(seconds=seconds)), style="progress.remaining")
 
 
 def summary_table(report: dict[str, Any]) -> Table:

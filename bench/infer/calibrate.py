@@ -25,7 +25,7 @@ from bench.infer.calibration import (
     write_calibration,
 )
 from bench.infer.cloud import Cloud
-from bench.infer.model import Model, load_model
+from bench.infer.model import Model, load_model, weights_file
 from bench.matching import rotation_degrees
 from bench.metrics import line_degrees
 from bench.requests import CalibrateRequest
@@ -33,11 +33,10 @@ from bench.runs.align import aligned
 from bench.runs.train import pick_device
 from bench.scoring.frame import LEAST_SAMPLES
 from bench.twin.record import Twin
-from scapo.alignment import Alignment
 from scapo.method import evenly
 from scapo.predictor import Predictor, find
 from scapo.store import Split, StoreError, open_split
-from scapo.store.checkpoint import WEIGHTS
+from scapo.store.files import require_suffix
 
 FOLDS = 5
 """Of the objects: probabilities that `reliability` judges come from maps fitted without them."""
@@ -66,18 +65,16 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
         The calibration, and the files written.
 
     Raises:
-        StoreError: No such model or data, or too few samples.
+        StoreError: No such model or data, too few samples, or a picture that is no PNG.
     """
-    checkpoint = find(request.checkpoint)
-    file = checkpoint / WEIGHTS if checkpoint.is_dir() else checkpoint
-    model = load_model(file, pick_device(request.device), None)
-    split = open_split(request.data, model.category.name, request.split)
+    if request.picture is not None:
+        require_suffix(request.picture, ".png")
+    file = weights_file(find(request.checkpoint))
+    own = load_model(file, pick_device(request.device), None)
+    split = open_split(request.data, own.category.name, request.split)
     labelled = _labelled(split, request.limit)
     clouds = [Cloud(points=points) for points in labelled.points]
-    alignment = _aligned(model, split, request)
-    if alignment is not None:
-        asked = model.predictor
-        model = replace(model, predictor=Predictor(asked.model, asked.device, alignment))
+    model = _in_object_frame(own, split, request)
     found = Calibration(
         model=model.digest,
         mode=request.mode,
@@ -85,7 +82,7 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
         split=request.split,
         data=split.manifest.digest,
         samples=len(clouds),
-        alignment=alignment,
+        alignment=None if own.predictor.in_object_frame else model.predictor.alignment,
         joint=(),
         part=(),
         reliability={},
@@ -114,24 +111,22 @@ def _whole(cloud: Cloud, model: Model, request: CalibrateRequest) -> Twin:
     return agreement(cloud, ask("", cloud, model, request.mode), model, request.mode)
 
 
-def _aligned(model: Model, split: Split, request: CalibrateRequest) -> Alignment | None:
-    """What brings the model's answers to the object's frame, fitted on the same clouds.
-
-    None where they are in it already.
+def _in_object_frame(model: Model, split: Split, request: CalibrateRequest) -> Model:
+    """The model, brought to the object's frame by the same clouds where it is not in it.
 
     Raises:
         StoreError: Too few have labels and an answer.
     """
     asked = model.predictor
     if asked.in_object_frame:
-        return None
+        return model
     found = aligned(asked.model, split, request.limit, request.mode, asked.device)
     if found is None:
         raise StoreError(
             f"{split.folder}: expected at least {LEAST_SAMPLES} labelled clouds in which the model "
             "finds every part, found fewer"
         )
-    return found
+    return replace(model, predictor=Predictor(asked.model, asked.device, found))
 
 
 def _labelled(split: Split, limit: int | None) -> Labelled:

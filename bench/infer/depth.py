@@ -208,7 +208,8 @@ def _from_file(path: Path) -> tuple[float, ...]:
     names = [("fx",), ("fy",), ("cx", "ppx"), ("cy", "ppy")]
     values = [next((named[n] for n in options if n in named), None) for options in names]
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-        raise InputError(f"{path}: expected a matrix K or fx, fy, cx, cy, found {list(named)[:9]}")
+        found = f"{list(named)[:9]}" if None in values else f"the values {values}"
+        raise InputError(f"{path}: expected a matrix K or numbers fx, fy, cx, cy, found {found}")
     return tuple(float(cast("float", value)) for value in values)
 
 

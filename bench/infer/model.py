@@ -14,6 +14,7 @@ from scapo.predictor import Predictor, find, released
 from scapo.store.checkpoint import WEIGHTS, check_header
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
+from scapo.text import did_you_mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +44,7 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
         StoreError: None there, or a calibration that belongs to another.
     """
     path = find(what)
-    file = path / WEIGHTS if path.is_dir() else path
+    file = weights_file(path)
     method, header = load(path)
     digest = sha256_file(file)
     beside = None if mode is None else calibration_file(file, mode)
@@ -61,6 +62,11 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
     )
 
 
+def weights_file(path: Path) -> Path:
+    """The checkpoint of a run folder, or the file itself."""
+    return path / WEIGHTS if path.is_dir() else path
+
+
 def load_models(run: Path | None, category: str | None, device: str, mode: Mode) -> list[Model]:
     """Those that are asked: of the run or the category, or every released one.
 
@@ -76,6 +82,7 @@ def load_models(run: Path | None, category: str | None, device: str, mode: Mode)
         known = f"one of {', '.join(weights)}" if weights else "none, as no model is released yet"
         raise StoreError(
             f"--category {category}: expected {known}; a run of your own is given by --run RUN"
+            f"{did_you_mean(category, weights)}"
         )
     names = list(weights) if category is None else [category]
     if not names:

@@ -24,7 +24,7 @@ from scapo.records import map_tensors
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import check_header, require_fields
 from scapo.store.definitions import foreign
-from scapo.store.files import Arrays
+from scapo.store.files import Arrays, require_suffix
 from scapo.store.files import Header as StoredHeader
 from scapo.store.predictions import Header, write_predictions
 from scapo.store.provenance import machine
@@ -51,8 +51,9 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
 
     Raises:
         ValueError: `oracle` for a method that cannot use labels.
-        StoreError: No checkpoint, or no such data.
+        StoreError: No checkpoint, no such data, or a file of another suffix to write.
     """
+    require_suffix(request.out, ".safetensors")
     method, header = load(request.checkpoint)
     require_fields(header, ("seed", "steps"), request.checkpoint)
     device = pick_device(request.device)

@@ -32,7 +32,7 @@ from scapo.store.checkpoint import (
     require_fields,
     to_arrays,
 )
-from scapo.store.files import read
+from scapo.store.files import read, require_suffix
 from scapo.store.samples import SampleDataset, observe, observed
 
 MAX_BYTES = 4 << 20
@@ -104,8 +104,7 @@ def release(request: ReleaseRequest) -> list[Path]:
     Raises:
         StoreError: No finished run there, no such data, or a model that does not fit.
     """
-    if request.out.suffix != ".safetensors":
-        raise StoreError(f"--out: expected a name that ends in .safetensors, found {request.out}")
+    require_suffix(request.out, ".safetensors")
     method, header = load(request.checkpoint)
     require_fields(header, RUN_FIELDS, request.checkpoint)
     if not header["finished"]:

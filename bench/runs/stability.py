@@ -19,7 +19,7 @@ from bench.scoring.scores import Rows, to_arrays
 from bench.scoring.truth import revolute
 from scapo.method import AbstractMethod, Mode, evenly
 from scapo.store import Split, open_split, write_bytes
-from scapo.store.files import Header
+from scapo.store.files import Header, require_suffix
 from scapo.store.provenance import commit, machine
 from scapo.store.samples import SampleDataset
 from scapo.types import Observation
@@ -31,9 +31,10 @@ def measure_stability(request: StabilityRequest) -> dict[str, Any]:
     """Measure a method in each mode and write the report; returns it.
 
     Raises:
-        StoreError: No checkpoint, or no such data.
+        StoreError: No checkpoint, no such data, or a file of another suffix to write.
         ValueError: Subsets that are no smaller than the clouds.
     """
+    require_suffix(request.out, ".json")
     method, header = load(request.checkpoint)
     device = pick_device(request.device)
     method.to(device)

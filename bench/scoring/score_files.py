@@ -26,6 +26,7 @@ from jaxtyping import Int
 from bench.metrics import METRICS
 from bench.scoring.scores import Errors
 from scapo.store import StoreError, sha256_bytes, sha256_file
+from scapo.store.files import require_suffix
 from scapo.store.json_records import from_json, read_json
 from scapo.store.regular import read_regular
 from scapo.text import as_cell, from_cell
@@ -176,8 +177,7 @@ class Report:
 
 def side_file(scores: Path) -> Path:
     """The JSON beside a scores file."""
-    if not scores.name.endswith(SUFFIX) or scores.name == SUFFIX:
-        raise StoreError(f"{scores}: expected a name that ends in {SUFFIX}, found {scores.name!r}")
+    require_suffix(scores, SUFFIX)
     return scores.with_name(scores.name.removesuffix(SUFFIX) + ".json")
 
 

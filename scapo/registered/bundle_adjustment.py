@@ -97,15 +97,26 @@ def first_fit(
     placement: Placement,
     config: DiscoveryConfig,
     generator: torch.Generator,
+    *,
+    known: bool = False,
 ) -> tuple[Placement, Float[Tensor, " B"]]:
-    """Rounds from a proposal, states unknown; a sliding joint gets its axis after the first."""
+    """Rounds from a proposal; a sliding joint gets its axis after the first.
+
+    Args:
+        template: Changed in place.
+        views: B views.
+        placement: Of the bases; states count where they are `known`.
+        config: Options of axes.
+        generator: Draws points.
+        known: Whether states are; else they are sought from the first step on.
+    """
     kinds, axis_weight = template.kinds, 0.0
     states = wide_states(kinds)
     for number in range(ROUNDS):
         options = FitOptions(
             steps=FIRST_STEPS,
             sharpness=BLUNT if number == 0 else SHARP,
-            search_states=FIRST_SEARCHED,
+            search_states=() if known and number == 0 else FIRST_SEARCHED,
             axis_weight=axis_weight,
         )
         placement, _ = bundle_adjust(

@@ -18,17 +18,27 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 
 from scapo.categories import JointKind
-from scapo.method import evenly
+from scapo.method import Journal, evenly
 from scapo.records import take
 from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.initialisation import first_candidates
-from scapo.registered.objects import known_objects, object_candidates, owned_views
+from scapo.registered.course import JUDGES, Course, numbered, plan_of
+from scapo.registered.initialisation import common_frame, fitted_proposals
+from scapo.registered.joint_proposals import PosedViews
+from scapo.registered.objects import (
+    OneObject,
+    draws_of,
+    object_candidate,
+    one_object,
+    owned_views,
+    surest_first,
+)
 from scapo.registered.pose_search import (
     Searched,
     SearchResult,
@@ -41,7 +51,6 @@ from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
 
-JUDGES = 4  # At most one view in so many is held out
 STRIDE = 3  # Views by which the draws are apart
 
 
@@ -59,6 +68,7 @@ def discover(
     config: DiscoveryConfig,
     generator: torch.Generator,
     objects: Sequence[PartialViews] = (),
+    journal: Journal = Journal(),  # noqa: B008 - it has no state
 ) -> Discovery:
     """The articulated template of views of one category, and its placement in all of them.
 
@@ -68,32 +78,36 @@ def discover(
         config: How much is tried.
         generator: Of all that is drawn.
         objects: Views of one object each, where it is known which show the same.
+        journal: Told of every step; keeps them.
     """
+    plan = plan_of(config, kinds, len(views.points), len(objects))
+    course = Course(kinds, generator, plan, journal)
     judges, others = held_out(views, config.judged)
     total = len(others.points)
     half: Searched = take(others, evenly(total, config.searched // 2))
     searched: Searched = take(others, evenly(total, config.searched))
     if objects:
         config = replace(config, way_out=False)  # the objects' own motions tell the axes
-        known = known_objects(objects, kinds, config, generator)
-        tried = object_candidates(known, kinds, config, generator)
+        known = _known_objects(objects, kinds, config, course)
+        tried = _of_objects(known, kinds, config, course)
         half = owned_views(known[: len(known) // 2], config.searched // 2)
         searched = owned_views(known, config.searched)
     else:
-        tried = _of_draws(others, kinds, config, generator)
-    candidates = leaders(tried, judges, config.finalists, config)
-    for share in config.heats:
-        candidates = [advance(one, half, share, config, generator) for one in candidates]
-    best, shares = leaders(candidates, judges, 1, config)[0], config.trusted
+        tried = _of_draws(others, kinds, config, course)
+    best, shares = _best(tried, judges, half, config, course), config.trusted
+    rounds = numbered("round", len(shares))
     if config.mirror and shares:
-        best, shares = completed(best, judges, half, config, generator), shares[1:]
-    for share in shares:
-        best = advance(best, searched, share, config, generator)
+        best, shares = completed(best, judges, half, config, course), shares[1:]
+        rounds = rounds[1:]
+    for name, share in zip(rounds, shares, strict=True):
+        best = course.step(name, partial(advance, best, searched, share, config, generator))
         logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
-    best = densified(best, config, generator)
-    if config.leans:
-        best = with_axis_deviation(best, judges, config, generator)
-    return Discovery(template=best.template, found=search_views(best, views, config))
+    best = course.step("dense template", partial(densified, best, config, generator))
+    if config.leans and "revolute" in kinds:
+        deviating = partial(with_axis_deviation, best, judges, config, generator)
+        best = course.step("deviating axes", deviating)
+    found = course.step("search of all views", partial(search_views, best, views, config))
+    return Discovery(template=best.template, found=found)
 
 
 def held_out(views: PartialViews, count: int) -> tuple[PartialViews, PartialViews]:
@@ -105,31 +119,83 @@ def held_out(views: PartialViews, count: int) -> tuple[PartialViews, PartialView
 
 
 def _of_draws(
-    views: PartialViews,
+    views: PartialViews, kinds: tuple[JointKind, ...], config: DiscoveryConfig, course: Course
+) -> list[Candidate]:
+    """The first candidates of all draws of views, of which nothing is known."""
+    total, tried = len(views.points), list[Candidate]()
+    for number, draw in enumerate(numbered("draw", config.draws)):
+        seeds = take(views, (evenly(total, config.seeds) + STRIDE * number) % total)
+        frame = partial(common_frame, seeds, config.rotations, config.agreeing)
+        posed = course.step(f"{draw}, registration", frame)
+        fitted = partial(_contenders, posed, kinds, config, course.generator)
+        tried += course.step(f"{draw}, templates", fitted)
+        logger.info("%s: %d first templates", draw, len(tried))
+    return tried
+
+
+def _contenders(
+    posed: PosedViews,
     kinds: tuple[JointKind, ...],
     config: DiscoveryConfig,
     generator: torch.Generator,
 ) -> list[Candidate]:
-    """The first candidates of all draws of views."""
-    total, tried = len(views.points), list[Candidate]()
-    for draw in range(config.draws):
-        seeds = (evenly(total, config.seeds) + STRIDE * draw) % total
-        found = first_candidates(take(views, seeds), kinds, config, generator)
-        tried += found[: config.contenders]
-        logger.info("draw %d of %d: %d first templates", draw + 1, config.draws, len(tried))
-    return tried
+    """The first templates of a draw that held-out views will judge."""
+    return fitted_proposals(posed, kinds, config, generator)[: config.contenders]
 
 
-def leaders(
-    tried: list[Candidate], judges: PartialViews, count: int, config: DiscoveryConfig
+def _known_objects(
+    objects: Sequence[PartialViews],
+    kinds: tuple[JointKind, ...],
+    config: DiscoveryConfig,
+    course: Course,
+) -> list[OneObject]:
+    """The objects each by itself, the surest first."""
+    return surest_first(
+        [
+            course.step(name, partial(one_object, views, kinds, config, course.generator))
+            for name, views in zip(numbered("object", len(objects)), objects, strict=True)
+        ]
+    )
+
+
+def _of_objects(
+    known: list[OneObject], kinds: tuple[JointKind, ...], config: DiscoveryConfig, course: Course
 ) -> list[Candidate]:
-    """Those of the candidates that explain the held-out views best, the best first."""
+    """The first candidates of all draws of objects."""
+    draws, generator = draws_of(known, config.draws), course.generator
+    return [
+        course.step(f"{name}, template", partial(object_candidate, draw, kinds, config, generator))
+        for name, draw in zip(numbered("draw", len(draws)), draws, strict=True)
+    ]
+
+
+def _best(
+    tried: list[Candidate],
+    judges: PartialViews,
+    searched: Searched,
+    config: DiscoveryConfig,
+    course: Course,
+) -> Candidate:
+    """The winner of the tournament: candidates are judged, go through the rungs, and again."""
+    order = course.step("judging first templates", partial(ranked, tried, judges, config))
+    left = [tried[k] for k in order[: config.finalists]]
+    for rung, share in zip(numbered("rung", len(config.heats)), config.heats, strict=True):
+        names = [f"{rung}, {one}" for one in numbered("template", len(left))]
+        left = [
+            course.step(name, partial(advance, one, searched, share, config, course.generator))
+            for name, one in zip(names, left, strict=True)
+        ]
+    return left[course.step("judging templates", partial(ranked, left, judges, config))[0]]
+
+
+def ranked(tried: list[Candidate], judges: PartialViews, config: DiscoveryConfig) -> list[int]:
+    """The candidates by how well they explain the held-out views, the best first."""
     if len(tried) == 1:
-        return tried
+        return [0]
     losses = [unexplained(one, judges, config) for one in tried]
-    order = sorted(range(len(tried)), key=losses.__getitem__)[:count]
-    logger.info("templates judged: %s; kept: %s", " ".join(f"{x:.3f}" for x in losses), order)
-    return [tried[k] for k in order]
+    order = sorted(range(len(tried)), key=losses.__getitem__)
+    logger.info("templates judged: %s; best: %s", " ".join(f"{x:.3f}" for x in losses), order)
+    return order
 
 
 def advance(
@@ -151,7 +217,7 @@ def completed(
     judges: PartialViews,
     searched: Searched,
     config: DiscoveryConfig,
-    generator: torch.Generator,
+    course: Course,
 ) -> Candidate:
     """One round of the candidate as it is, and of three with a mirror image of its base added.
 
@@ -161,17 +227,33 @@ def completed(
     Views of such a side were turned until they looked like others: for their round cameras are
     sought anywhere.
     """
-    share = config.trusted[0]
     wholes = [replace(candidate, template=mirrored(candidate.template, axis)) for axis in range(3)]
+    share, generator = config.trusted[0], course.generator
+    first = numbered("round", len(config.trusted))[0]
+    names = [f"{first}, {one}" for one in numbered("mirror image", len(wholes) + 1)]
     tried = [
-        advance(candidate, searched, share, config, generator),
-        *(advance(whole, searched, share, config, generator, anywhere=True) for whole in wholes),
+        course.step(name, partial(advance, one, searched, share, config, generator, anywhere=new))
+        for name, one, new in zip(
+            names, [candidate, *wholes], [False, True, True, True], strict=True
+        )
     ]
-    losses = [unexplained(densified(one, config, generator), judges, config) for one in tried]
+    losses = course.step(
+        "judging mirror images", partial(_dense_losses, tried, judges, config, generator)
+    )
     best = min(range(len(tried)), key=losses.__getitem__)
     shown = " ".join(f"{x:.3f}" for x in losses)
     logger.info("template as it is and with mirror images judged: %s; kept: %d", shown, best)
     return tried[best]
+
+
+def _dense_losses(
+    tried: list[Candidate],
+    judges: PartialViews,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+) -> list[float]:
+    """What held-out views cost the candidates with dense templates."""
+    return [unexplained(densified(one, config, generator), judges, config) for one in tried]
 
 
 @torch.no_grad()

@@ -33,17 +33,6 @@ TEMPLATE_EVERY = 2  # Of all moved and still points, one in so many may become o
 SURENESS = 3.0  # Logit of the part that a point begins in
 
 
-def first_candidates(
-    views: PartialViews,
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[Candidate]:
-    """Templates from views of which nothing is known, those with the least loss first."""
-    posed = common_frame(views, config.rotations, config.agreeing)
-    return fitted_proposals(posed, kinds, config, generator)
-
-
 def common_frame(
     views: PartialViews, rotations: int, share: float, hidden_cost: float = HIDDEN_COST
 ) -> PosedViews:
@@ -83,7 +72,7 @@ def fitted_proposals(
     """A template for every combination of proposed joints, those with the least loss first."""
     moved, proposals = zip(*propose_joints(posed, kinds, generator), strict=True)
     none = torch.zeros(len(posed.rotation), len(kinds))
-    each = config.starts if len(kinds) == 1 else min(config.starts, AXES_OF_SEVERAL)
+    each = fitted_of_each(config, len(kinds))
     tried: list[tuple[float, Candidate]] = []
     for combination in product(*[found[:each] for found in proposals]):
         surface = posed.world(moved[0].shape[1])
@@ -93,6 +82,11 @@ def fitted_proposals(
         inliers = Inliers(views=posed.views, placement=placement)
         tried.append((float(loss.mean()), Candidate(template=template, inliers=inliers)))
     return [candidate for _, candidate in sorted(tried, key=lambda pair: pair[0])]
+
+
+def fitted_of_each(config: DiscoveryConfig, joints: int) -> int:
+    """Proposals of each joint that templates are fitted from."""
+    return config.starts if joints == 1 else min(config.starts, AXES_OF_SEVERAL)
 
 
 def first_template(

@@ -35,7 +35,10 @@ LEAST_MOVED = 12  # Points of a view that must have moved for it to be in a pair
 CARRIED = 40  # Points of a view that are carried by every candidate motion, those that moved first
 TIE = 0.01  # Largest random number by which points are drawn among those that moved alike
 AWAY = 9.0  # Normalised place of points that did not move: nothing is carried there
-OPENED, TURNED = (0.06, 0.5), (math.radians(8), math.radians(100))
+AMOUNT: dict[JointKind, tuple[float, float]] = {
+    "prismatic": (0.06, 0.5),
+    "revolute": (math.radians(8), math.radians(100)),
+}
 """Least and largest amount that is tried, to either side: normalised length, and rad."""
 AMOUNTS = 12  # Amounts to either side: coarser ones pass by where long thin parts lie
 PIVOTS, BEYOND = 9, 0.08
@@ -128,14 +131,11 @@ def candidates(
         directions: Candidate axes.
         generator: Draws the `PAIRS` of views.
     """
-    points, normals = posed.world(moved.shape[1])
     rows = (moved.sum(1) >= LEAST_MOVED).nonzero()[:, 0]
     if len(rows) < 2:
         return [JointProposal(axis=d, pivot=torch.zeros(3), score=0.0) for d in directions]
-    pick = moved[rows].to(points) + TIE * torch.rand(moved[rows].shape, generator=generator)
-    index = pick.topk(min(CARRIED, moved.shape[1]), dim=1).indices
-    weight = moved[rows].gather(1, index).to(points)
-    points, normals = gather(points[rows], index), gather(normals[rows], index)
+    tie = TIE * torch.rand(moved[rows].shape, generator=generator)
+    points, normals, weight = most_moved(take(posed, rows), moved[rows], tie)
     grid = NearestGrid.build(torch.where(weight[..., None] > 0, points, AWAY), normals)
     drawn = torch.randint(len(rows), (PAIRS, 2), generator=generator)
     drawn = drawn[drawn[:, 0] != drawn[:, 1]]
@@ -143,9 +143,9 @@ def candidates(
     for direction in directions:
         pivots = _pivots(points[weight > 0], direction, kind)
         score = points.new_zeros(len(pivots))
-        turn, move = _motions(direction, pivots, kind)
+        turn, move = motions(direction, pivots, _amounts(kind), kind)
         for i, j in drawn.tolist():
-            moved_points = torch.einsum("vdab,kb->vdka", turn, points[i]) + move
+            moved_points = torch.einsum("vdab,kb->vdka", turn, points[i]) + move[:, :, None]
             moved_normals = torch.einsum("vdab,kb->vdka", turn, normals[i])
             gain = _gain(posed, grid, (j, int(rows[j])), moved_points, moved_normals)
             score += (gain * weight[i]).sum(-1).amax(1) / weight[i].sum()
@@ -173,21 +173,66 @@ def _pivots(
 
 
 def _amounts(kind: JointKind) -> Float[Tensor, " D"]:
-    half = torch.linspace(*(OPENED if kind == "prismatic" else TURNED), AMOUNTS)
+    half = torch.linspace(*AMOUNT[kind], AMOUNTS)
     return torch.cat([torch.zeros(1), half, -half])
 
 
-def _motions(
-    direction: Float[Tensor, " 3"], pivots: Float[Tensor, "V 3"], kind: JointKind
-) -> tuple[Float[Tensor, "V D 3 3"], Float[Tensor, "V D 1 3"]]:
-    """Rotation and translation of every pivot and amount; the first amount is none."""
-    step = _amounts(kind).to(direction)[:, None] * direction
+def motions(
+    direction: Float[Tensor, " 3"],
+    pivots: Float[Tensor, "V 3"],
+    amount: Float[Tensor, " D"],
+    kind: JointKind,
+) -> tuple[Float[Tensor, "V D 3 3"], Float[Tensor, "V D 3"]]:
+    """Rotation and translation by every amount about every pivot; a sliding joint has one."""
+    step = amount.to(direction)[:, None] * direction
     if kind == "prismatic":
-        turn = torch.eye(3).to(direction).expand(1, len(step), 3, 3)
-        return turn, step[None, :, None]
+        return torch.eye(3).to(direction).expand(1, len(step), 3, 3), step[None]
     turn = rotvec_to_rotmat(step).expand(len(pivots), -1, 3, 3)
-    move = pivots[:, None] - (turn @ pivots[:, None, :, None])[..., 0]
-    return turn, move[:, :, None]
+    return turn, pivots[:, None] - (turn @ pivots[:, None, :, None])[..., 0]
+
+
+def most_moved(
+    posed: PosedViews, moved: Bool[Tensor, "B K"], tie: Float[Tensor, "B K"]
+) -> tuple[Float[Tensor, "B C 3"], Float[Tensor, "B C 3"], Float[Tensor, "B C"]]:
+    """`CARRIED` points of every view in the common frame, those that moved first; their normals.
+
+    Args:
+        posed: B views.
+        moved: Which points of them.
+        tie: Small numbers by which points are drawn among those that moved alike.
+
+    Returns:
+        Points, normals, and 1 where a point moved.
+    """
+    points, normals = posed.world(moved.shape[1])
+    index = (moved.to(points) + tie).topk(min(CARRIED, moved.shape[1]), dim=1).indices
+    weight = moved.gather(1, index).to(points)
+    return gather(points, index), gather(normals, index), weight
+
+
+def matched(
+    posed: PosedViews,
+    grid: NearestGrid,
+    target: tuple[Int[Tensor, " Q"], Int[Tensor, " Q"]],
+    points: Float[Tensor, "H K 3"],
+    normals: Float[Tensor, "H K 3"],
+) -> Float[Tensor, "Q H K"]:
+    """How far Q views show the same surface at oriented points; a little where they hide them.
+
+    Args:
+        posed: Views.
+        grid: Of some of their points.
+        target: Rows of the grid, and which views those are.
+        points: In the common frame.
+        normals: Theirs.
+    """
+    rows, views = target
+    shape = (len(rows), *points.shape)
+    _, weight = grid.match(rows, points.expand(shape), normals.expand(shape), SHARPNESS)
+    there = points.flatten(0, 1) @ posed.rotation[views].mT + posed.translation[views][:, None]
+    _, hidden = take(posed.views, views).free_and_hidden(there, BEHIND)
+    unseen = weight.clamp_min(UNSEEN * (1 - HIDDEN_COST))
+    return torch.where(hidden.view_as(weight), unseen, weight)
 
 
 def _gain(
@@ -198,13 +243,7 @@ def _gain(
     normals: Float[Tensor, "V D K 3"],
 ) -> Float[Tensor, "V D K"]:
     """What each motion explains of each point in the target view beyond standing still."""
-    row, view = target
-    index = torch.tensor([row], device=points.device)
-    match = grid.match(index, points.flatten(0, 1)[None], normals.flatten(0, 1)[None], SHARPNESS)
-    there = points.flatten(0, 2) @ posed.rotation[view].T + posed.translation[view]
-    one: Int[Tensor, " 1"] = torch.tensor([view], device=points.device)
-    _, hidden = take(posed.views, one).free_and_hidden(there[None], BEHIND)
-    weight = match[1].view(points.shape[:3])
-    unseen = weight.clamp_min(UNSEEN * (1 - HIDDEN_COST))
-    weight = torch.where(hidden.view_as(weight), unseen, weight)
+    row, view = (torch.tensor([index], device=points.device) for index in target)
+    weight = matched(posed, grid, (row, view), points.flatten(0, 1), normals.flatten(0, 1))
+    weight = weight.view(points.shape[:3])
     return torch.maximum(weight, weight[:, :1]) - weight[:, :1]

@@ -54,6 +54,7 @@ SHARED = 0.03  # Reach (of `surface_features`) within which surface is the same,
 LEFT_OUT = 0.2
 """Share of each part's points that enter no template: those with the least of the same surface."""
 LEAST_SHARE = 1e-3  # Of a part in a template point, so that its logit is finite
+SECONDS = 0.05  # Of one core for each learned cloud
 CHUNK = 64  # Views, and as many times 16 points, that are compared at once
 
 
@@ -71,6 +72,10 @@ class LabelledRegistered(AbstractRegistered):
 
     name: ClassVar[str] = "registered-labelled"
     supervision: frozenset[Supervision] = frozenset({"segmentation", "pose", "joint", "instance"})
+
+    def _seconds(self, clouds: int) -> float:
+        """Of the template and the losses of true placements."""
+        return SECONDS * clouds
 
     def _found(
         self,

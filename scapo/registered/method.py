@@ -37,6 +37,7 @@ from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import RegisteredConfig, SearchConfig
+from scapo.registered.course import plan_of
 from scapo.registered.decode import metric_limits, nearest_weights, placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
@@ -152,6 +153,7 @@ class AbstractRegistered(AbstractMethod):
                 f"found {len(observation.points)}"
             )
         index = evenly(len(observation.points), self.config.learned)
+        self.journal.tell("first look at the clouds", 0.0, self._seconds(len(index)))
         cloud = observation.points[index.to(observation.points.device)].cpu()
         similarity, views, inlier = self._observed(cloud)
         device = self.template.points.device
@@ -172,6 +174,10 @@ class AbstractRegistered(AbstractMethod):
         points, similarity = normalise(replaced(cloud, inlier))
         camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
         return similarity, observe(points, camera, count=self.config.points), inlier
+
+    @abstractmethod
+    def _seconds(self, clouds: int) -> float:
+        """How long finding the template usually takes, with so many learned clouds, on one core."""
 
     @abstractmethod
     def _found(
@@ -428,6 +434,12 @@ class TemplateRegistration(AbstractRegistered):
         known = ("objects known",) if self.supervision else ()
         return " ".join((*known, *super().variant.split()))
 
+    def _seconds(self, clouds: int) -> float:
+        """Of all steps of a discovery."""
+        config = self.config.discovery
+        objects = config.objects if self.supervision else 0
+        return sum(plan_of(config, self.template.kinds, clouds, objects).values())
+
     def _found(
         self,
         learned: LearnedClouds,
@@ -438,10 +450,15 @@ class TemplateRegistration(AbstractRegistered):
         """By registration and bundle adjustment of the views."""
         kinds, config = self.template.kinds, self.config.discovery
         groups = [] if labels.instance is None else grouped(labels.instance.cpu(), config)
-        objects = [self._observed(observation.points[rows].cpu())[1] for rows in groups]
+        objects = [self._of_one_size(observation.points[rows].cpu()) for rows in groups]
         if labels.instance is not None and not objects:
             logger.warning("too few clouds of any one object: which show the same is not used")
-        return discover(learned.views, kinds, config, generator, objects)
+        return discover(learned.views, kinds, config, generator, objects, self.journal)
+
+    def _of_one_size(self, cloud: Float[Tensor, "B N 3"]) -> PartialViews:
+        """Clouds of one object, normalised all alike: it is as large in all of them."""
+        similarity, views, _ = self._observed(cloud)
+        return views.scaled(similarity.scale.median() / similarity.scale)
 
     def _prediction(
         self,

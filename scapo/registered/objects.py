@@ -32,18 +32,22 @@ from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_
 from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
+from scapo.registered.view_states import Motion, motion_of
 from scapo.registered.views import TINY, PartialViews
 
 LEAST_OBJECTS = 4  # That a first template is made of
 LEAST_SHOWN = 8  # Clouds of an object, at least, that are registered with one another
 AGREEING = 0.8  # Share of an object's views, those that agree best, that are gone on with
 FITTED = 60  # Views, at most, that a template is fitted to
-WIDEST = 0.42  # Share of the objects that are gone on with: those whose cameras are farthest apart
+SURE, SHOWN = 0.67, 0.42
+"""Share of the objects whose frames are surest, and of all those among them whose parts other views
+show best: a first template is made of these."""
 LEAST_HALF = 0.02  # Normalised length: half the side of a body's box at least
 FARTHEST = 1.5  # Halves of the body's box beyond which a part is not farther away
 SIZES = 1.0  # Largest log scale of a body's box against the others'
 WEIGHT_CAMERA, WEIGHT_SPREAD, WEIGHT_WAY, WEIGHT_AXIS = 1.3, 2.0, 1.0, 1.0
 """Of what two objects are compared by; their sums of products are what agrees."""
+SUPPORT = 3.0  # Of mean log support against the log of how far cameras are spread
 SURER = 30.0  # Power of a proposal's score against the best one's, by which its axis counts
 SWEEPS = 10  # Over all objects, in which each takes the frame that agrees best with the others
 
@@ -57,6 +61,8 @@ class OneObject:
     """By each joint."""
     proposals: tuple[list[JointProposal], ...]
     """Of each joint, best first."""
+    motions: tuple[Motion, ...]
+    """Of each joint along its best proposal."""
     centre: Float[Tensor, " 3"]
     half: Float[Tensor, " 3"]
     """Of the box (`SPAN`) of what did not move."""
@@ -90,14 +96,17 @@ class _Start:
     """Views of several objects in one frame, before a template is fitted to them."""
 
     posed: PosedViews
+    points: Float[Tensor, "B K 3"]
+    """In that frame, moved back to state 0 and to the size that objects have on average."""
+    normals: Float[Tensor, "B K 3"]
     moved: tuple[Bool[Tensor, "B K"], ...]
+    state: Float[Tensor, "B J"]
     log_scale: Float[Tensor, "B 3"]
     """Of each view's object against the others."""
 
-    def placement(self, joints: int) -> Placement:
-        """As far as it is known: all states are 0."""
-        none = torch.zeros(len(self.log_scale), joints)
-        still = Placement.at(self.posed.rotation, self.posed.translation, none)
+    def placement(self) -> Placement:
+        """Of the views."""
+        still = Placement.at(self.posed.rotation, self.posed.translation, self.state.clone())
         return replace(still, log_scale=self.log_scale.clone())
 
 
@@ -114,42 +123,35 @@ def owned_views(objects: Sequence[OneObject], count: int) -> OwnedViews:
     )
 
 
-def known_objects(
-    objects: Sequence[PartialViews],
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[OneObject]:
-    """The objects each by itself, those whose cameras are farthest apart first.
+def surest_first(known: Sequence[OneObject]) -> list[OneObject]:
+    """The objects, those whose frames are surest first.
 
-    Where views of two sides of an object were taken for one side, cameras gather.
+    Where views of two sides of an object were taken for one side, cameras gather; where poses are
+    right, views confirm each other's points.
     """
-    known = [one_object(views, kinds, config, generator) for views in objects]
     spread = torch.stack([one.cameras().var(0).sum() for one in known])
-    return [known[k] for k in spread.argsort(descending=True).tolist()]
+    support = torch.tensor([min(motion.support for motion in one.motions) for one in known])
+    sure = spread * (SUPPORT * support).exp()
+    return [known[k] for k in sure.argsort(descending=True).tolist()]
 
 
-def object_candidates(
-    objects: Sequence[OneObject],
-    kinds: tuple[JointKind, ...],
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> list[Candidate]:
-    """First templates of those objects that are surest, and of two thirds of them.
+def draws_of(objects: Sequence[OneObject], count: int) -> list[list[OneObject]]:
+    """So many draws, 4 at most, of sure objects whose motions are surest.
 
     Args:
-        objects: The surest first (`known_objects`).
-        kinds: Of the joints.
-        config: Points of a template, and options of the first fit.
-        generator: Draws points.
+        objects: The surest first (`surest_first`).
+        count: Of the draws, before those with too few objects are left out.
     """
-    widest = objects[: max(LEAST_OBJECTS, round(WIDEST * len(objects)))]
-    draws = [widest, *([one for k, one in enumerate(widest) if k % 3 != d] for d in range(3))]
-    return [
-        object_candidate(draw, kinds, config, generator)
-        for draw in draws[: config.draws]
-        if len(draw) >= LEAST_OBJECTS
-    ]
+    sure = objects[: max(LEAST_OBJECTS, round(SURE * len(objects)))]
+    shown = sorted(sure, key=lambda one: -min(motion.score for motion in one.motions))
+    return [[shown[k] for k in rows] for rows in rows_of_draws(len(objects), count)]
+
+
+def rows_of_draws(total: int, count: int) -> list[list[int]]:
+    """Which of the objects whose motions are surest each draw has: all, then two thirds of them."""
+    shown = range(min(total, max(LEAST_OBJECTS, round(SHOWN * total))))
+    draws = [list(shown), *([k for k in shown if k % 3 != d] for d in range(3))]
+    return [draw for draw in draws[:count] if len(draw) >= LEAST_OBJECTS]
 
 
 def object_candidate(
@@ -162,15 +164,16 @@ def object_candidate(
     readings = agreeing(known, kinds)
     halves = torch.stack([x.turn.abs() @ one.half for one, x in zip(known, readings, strict=True)])
     size = (halves.log() - halves.log().mean(0)).clamp(-SIZES, SIZES)
-    start = _joined(
-        [_in_common(one, x, scale) for one, x, scale in zip(known, readings, size, strict=True)]
-    )
     joints = _mean_joints(known, readings, size)
-    points, normals = start.posed.world(start.moved[0].shape[1])
-    surface = points / start.log_scale.exp()[:, None], normals
+    parts = [
+        _in_common(one, x, scale, joints, kinds)
+        for one, x, scale in zip(known, readings, size, strict=True)
+    ]
+    start = _joined(parts)
+    surface = start.points, start.normals
     template = first_template(surface, start.moved, joints, kinds, config.template_points)
-    views, placement = start.posed.views, start.placement(len(kinds))
-    placement, _ = first_fit(template, views, placement, config, generator)
+    views, placement = start.posed.views, start.placement()
+    placement, _ = first_fit(template, views, placement, config, generator, known=True)
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 
@@ -199,16 +202,21 @@ def one_object(
     points, _ = posed.world(moved[0].shape[1])
     still = points[~torch.stack(moved).any(0)]
     low, high = still.quantile(torch.tensor(SPAN).to(still), 0)
+    motions = tuple(
+        motion_of(posed, rows, found[0], kind)
+        for rows, found, kind in zip(moved, proposals, kinds, strict=True)
+    )
     return OneObject(
         posed=posed,
         moved=moved,
         proposals=proposals,
+        motions=motions,
         centre=(low + high) / 2,
         half=((high - low) / 2).clamp_min(LEAST_HALF),
     )
 
 
-def agreeing(objects: list[OneObject], kinds: tuple[JointKind, ...]) -> list[_Reading]:
+def agreeing(objects: Sequence[OneObject], kinds: tuple[JointKind, ...]) -> list[_Reading]:
     """How each object is read so that all agree.
 
     Every object starts a consensus in turn; each object takes the reading nearest to the mean of
@@ -271,9 +279,34 @@ def quarter_turns() -> list[Float[Tensor, "3 3"]]:
     return list(torch.from_numpy(Rotation.create_group("O").as_matrix().round()).float())
 
 
-def _in_common(one: OneObject, reading: _Reading, log_scale: Float[Tensor, " 3"]) -> _Start:
-    """The object's views about the middle of its body, as it is read."""
+def _in_common(
+    one: OneObject,
+    reading: _Reading,
+    log_scale: Float[Tensor, " 3"],
+    joints: tuple[JointProposal, ...],
+    kinds: tuple[JointKind, ...],
+) -> _Start:
+    """The object's views about the middle of its body, as it is read.
+
+    Args:
+        one: The object.
+        reading: How its frame is turned and its joints are ordered.
+        log_scale: Of its body against the others'.
+        joints: Of all objects; states count along their axes.
+        kinds: Of them.
+    """
     posed = one.posed
+    points, normals = posed.world(one.moved[0].shape[1])
+    moved, states = list[Bool[Tensor, "B K"]](), list[Tensor]()
+    for k, own, joint, kind in zip(reading.order, reading.joints, joints, kinds, strict=True):
+        motion = one.motions[k]
+        if own is not one.proposals[k][0]:
+            motion = motion_of(posed, one.moved[k], own, kind)
+        rows = motion.moved[..., None]
+        back, facing = motion.back(posed, own, kind)
+        points, normals = torch.where(rows, back, points), torch.where(rows, facing, normals)
+        moved.append(motion.moved)
+        states.append(motion.state * torch.sign(joint.axis @ reading.turn @ own.axis))
     middle = (posed.rotation @ one.centre[:, None])[..., 0]
     return _Start(
         posed=PosedViews(
@@ -281,7 +314,10 @@ def _in_common(one: OneObject, reading: _Reading, log_scale: Float[Tensor, " 3"]
             rotation=posed.rotation @ reading.turn.T,
             translation=posed.translation + middle,
         ),
-        moved=tuple(one.moved[k] for k in reading.order),
+        points=(points - one.centre) @ reading.turn.T / log_scale.exp(),
+        normals=normals @ reading.turn.T,
+        moved=tuple(moved),
+        state=torch.stack(states, 1),
         log_scale=log_scale.expand(len(middle), 3),
     )
 

@@ -55,6 +55,15 @@ class PartialViews:
         """With these points only, of every view the same ones."""
         return replace(self, points=self.points[:, index], normals=self.normals[:, index])
 
+    def scaled(self, factor: Float[Tensor, " B"]) -> PartialViews:
+        """Each cloud so many times as large."""
+        return replace(
+            self,
+            points=self.points * factor[:, None, None],
+            camera=self.camera * factor[:, None],
+            depth=self.depth * factor[:, None, None],
+        )
+
     @torch.no_grad()
     def free_and_hidden(
         self, points: Float[Tensor, "B M 3"], tolerance: float

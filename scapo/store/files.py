@@ -36,6 +36,16 @@ Arrays = dict[str, np.ndarray]
 Header = dict[str, Any]
 
 
+def require_suffix(path: Path, suffix: str) -> None:
+    """Refuse a file to be written whose name does not say what will be in it.
+
+    Raises:
+        StoreError: Another suffix, or nothing before it.
+    """
+    if not path.name.endswith(suffix) or path.name == suffix:
+        raise StoreError(f"{path}: expected a name that ends in {suffix}, found {path.name!r}")
+
+
 def canonical_json(value: object) -> str:
     """Sorted, compact JSON: equal values give equal text."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

@@ -104,6 +104,10 @@ def read_prediction_header(path: Path) -> Header:
     Raises:
         StoreError: Not a predictions file, a second metadata entry, a missing or wrong field.
     """
+    if not path.exists():
+        raise StoreError(
+            f"{path}: expected a file, found none; `scapo-bench predict RUN --out FILE` writes one"
+        )
     try:
         record = read_header(path, PREDICTIONS)
         with safe_open(path, "numpy") as file:

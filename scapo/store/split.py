@@ -133,7 +133,8 @@ def find_split(folder: Path | str, category: str | None, split: str) -> Path:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        found = "a file" if folder.exists() else "none"
+        made = f"none; `scapo-data generate {category or 'CATEGORY'} --out {folder}` makes one"
+        found = "a file" if folder.exists() else made
         raise StoreError(f"{folder}: expected a folder of samples, found {found}")
 
     def named(top: Path) -> list[Path]:

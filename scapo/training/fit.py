@@ -25,7 +25,7 @@ from safetensors.numpy import load, save
 from torch import Tensor
 from torch.optim import Optimizer
 
-from scapo.method import AbstractMethod, Stage, Step, evenly
+from scapo.method import AbstractMethod, Journal, Stage, Step, evenly
 from scapo.store import checkpoint
 from scapo.store.files import Arrays
 from scapo.store.samples import TrainingData
@@ -65,14 +65,18 @@ class FitConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
-    """What a listener hears after each step."""
+    """What a listener hears after each step, and before each step of a start."""
 
     stage: Stage
     epoch: int
     done: float
-    """Share of the stage."""
+    """Share of the stage, or of its start."""
     loss: float | None
     """Mean of the last lines of the log; None between them."""
+    step: str = ""
+    """What the start of the stage is at; "" once it is over."""
+    left: float | None = None
+    """Seconds that the rest of the start will take, by estimate."""
 
 
 Listener = Callable[[Progress], None]
@@ -98,8 +102,9 @@ def fit(
     which is then not trained on.
 
     Writes config.json, metrics.jsonl, tensorboard/ (where that package is installed), pictures/
-    (where matplotlib is), checkpoint.safetensors and training.safetensors. With `resume` a run in
-    that folder is continued, or left as it is when it was finished.
+    (where matplotlib is), checkpoint.safetensors and training.safetensors, and start/ as long as a
+    method's start goes on. With `resume` a run in that folder is continued, or left as it is when
+    it was finished.
 
     Raises:
         TrainingError: The loss or its gradient is not finite.
@@ -217,18 +222,33 @@ class Trainer:
 
     def _start(self, stage: Stage) -> None:
         """The method's start of a stage, by the first rank for all; saved, as it may take long."""
-        began = time.monotonic()
+        began, earlier = time.monotonic(), 0.0
         if self.ranks.first:
-            observation, labels = self.data.observation, self.data.labels
-            self.method.start(stage.name, observation, labels, self.state.noise)
+            earlier = self._first_start(stage)
         if self.ranks.count > 1:
             state = save(checkpoint.to_arrays(self.method)) if self.ranks.first else b""
             arrays = load(self.ranks.from_first(state, self.config.device))
             checkpoint.load_arrays(self.method, arrays, self.folder.path)
-        self.state.position.spend(stage.name, time.monotonic() - began)
+        self.state.position.spend(stage.name, time.monotonic() - began + earlier)
         self.state.position.started = True
         if stage.epochs:
             self._save(None)
+
+    def _first_start(self, stage: Stage) -> float:
+        """That of the first rank, told and kept step by step; seconds of steps done before."""
+
+        def tell(words: str, done: float, left: float) -> None:
+            self.listener(
+                Progress(stage=stage, epoch=0, done=done, loss=None, step=words, left=left)
+            )
+
+        self.method.journal = journal = self.folder.journal(stage.name, tell)
+        try:
+            observation, labels = self.data.observation, self.data.labels
+            self.method.start(stage.name, observation, labels, self.state.noise)
+        finally:
+            self.method.journal = Journal()
+        return journal.earlier
 
     def _stage(self, stage: Stage, optimizer: Optimizer) -> None:
         """The epochs of a stage that are left."""

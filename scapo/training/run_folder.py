@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+import shutil
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -27,8 +28,11 @@ from scapo.store.files import (
     write_bytes,
 )
 from scapo.store.json_records import StoreError, from_json
+from scapo.training.journal import FORMAT, StepHeader, StoredJournal
 
 CONFIG = "config.json"
+START = "start"
+"""Folder of what the steps of a start made, as long as it goes on."""
 TIMING = "timing.json"
 """What differs from run to run, apart from all that does not."""
 NOW, BEST = "weights/", "best/"
@@ -140,12 +144,24 @@ class RunFolder:
         Raises:
             StoreError: There is one, and `resume` is not asked for.
         """
-        there = (self.path / checkpoint.TRAINING).is_file()
-        if there and not resume:
+        there, steps = (self.path / checkpoint.TRAINING).is_file(), started(self.path)
+        if (there or steps) and not resume:
             raise StoreError(
                 f"{self.path}: expected no run there, found one; --resume continues it"
             )
+        for path in () if there else steps:
+            try:
+                known = from_json(StepHeader, read_header(path, FORMAT), f"{path}: header")
+            except StoreError:  # the journal says so, and has the step done again
+                continue
+            self._check_same(path, known.run)
         return there
+
+    def journal(self, stage: str, tell: Callable[[str, float, float], None]) -> StoredJournal:
+        """That of a start which begins or goes on."""
+        header = json.loads(canonical_json(self.header(Position(), finished=False)))
+        same = {name: header[name] for name in SAME}
+        return StoredJournal(self.path / START, same, stage, tell)
 
     def load(self, state: State, rank: int = 0) -> tuple[bool, Arrays | None]:
         """Load the method and `state`; whether the run is finished, and the optimiser's part of it.
@@ -260,6 +276,7 @@ class RunFolder:
         }
         write_bytes(self.path / TIMING, (json.dumps(timing, indent=1) + "\n").encode())
         write(self.path / checkpoint.TRAINING, arrays, training)
+        shutil.rmtree(self.path / START, ignore_errors=True)  # no start goes on
 
 
 def moment_of(header: Header) -> tuple[int, ...]:
@@ -273,12 +290,19 @@ def noise_name(rank: int) -> str:
     return f"generator/noise/{rank}" if rank else "generator/noise"
 
 
+def started(run: Path) -> list[Path]:
+    """Files of the steps of a start that is not over."""
+    return sorted((run / START).glob("*.safetensors"))
+
+
 def kept(run: Path) -> str:
     """What an interrupted run leaves in its folder, in words."""
-    path = run / checkpoint.TRAINING
+    path, steps = run / checkpoint.TRAINING, len(started(run))
     try:
         header = read_header(path, checkpoint.TRAINING_FORMAT)
         step = from_json(TrainingHeader, header, str(path)).position.step
     except (StoreError, OSError):
+        if steps:
+            return f"saved {steps} steps of its start, resume continues from there"
         return "nothing was saved yet"
     return f"saved after step {step}, resume continues from there"

@@ -15,11 +15,11 @@ import sys
 import torch
 
 from scapo import store
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, JointKind
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import axis_angle, project_rotation, rotation_angle
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.objects import WIDEST, agreeing, grouped, known_objects
+from scapo.registered.objects import SURE, agreeing, grouped, one_object, surest_first
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.views import PartialViews, observe
 
@@ -38,7 +38,7 @@ def middle(turns: torch.Tensor) -> torch.Tensor:
 def main(data: str, category: str, seed: int) -> None:
     """Print a line for each object, the surest first, and one for all of them."""
     split, config = store.dataset(data, category, "train"), DiscoveryConfig()
-    kinds = tuple(joint.kind for joint in CATEGORIES[category].joints)
+    kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in CATEGORIES[category].joints)
     instance = torch.tensor([int(split[k]["instance"]) for k in range(len(split))])
     shown, truth = (
         list[PartialViews](),
@@ -49,12 +49,13 @@ def main(data: str, category: str, seed: int) -> None:
         cloud = torch.stack([torch.as_tensor(one["points"]) for one in some]).float()
         points, similarity = normalise(replaced(cloud, inlier_mask(cloud)))
         views = observe(points, -similarity.centre * similarity.scale[:, None])
-        shown.append(views)
+        shown.append(views.scaled(similarity.scale.median() / similarity.scale))
         for one, first in zip(some, views.points[:, 0].tolist(), strict=True):
             pose = torch.as_tensor(one["camera_T_part"][0]).float()
             truth[tuple(first)] = pose[:3, :3], torch.as_tensor(one["joint_axis"]).float()
-    known = known_objects(shown, kinds, config, torch.Generator().manual_seed(seed))
-    known = known[: round(WIDEST * len(known))]
+    generator = torch.Generator().manual_seed(seed)
+    known = surest_first([one_object(views, kinds, config, generator) for views in shown])
+    known = known[: round(SURE * len(known))]
     frames = []
     for one, reading in zip(known, agreeing(known, kinds), strict=True):
         posed = one.posed

@@ -116,6 +116,12 @@ def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
         load(tmp_path).predict(np.zeros((0, 96, 3)))
 
 
+def test_a_misspelt_category_is_told_the_one_that_looks_like_it(monkeypatch) -> None:
+    monkeypatch.setattr("scapo.predictor._weights", lambda: {"oven": Path(), "laptop": Path()})
+    with pytest.raises(StoreError, match=r"\(oven, laptop\), found none; did you mean 'oven'\?$"):
+        load("oevn")
+
+
 def test_released_weights_are_those_of_categories() -> None:
     for category, path in released().items():
         assert category in CATEGORIES

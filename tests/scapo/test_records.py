@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+import json
+import math
+from typing import Any
+
 import pytest
 import torch
+from torch import nn
 
-from scapo.records import cat, map_tensors, take
+from scapo.records import cat, map_tensors, pack, take, unpack
 from scapo.types import Joints, Labels, Observation, Prediction
 
 
@@ -57,3 +62,67 @@ def test_records_that_do_not_fit_are_not_joined() -> None:
         cat([Observation(points=points), Observation(points=points, color=points)])
     with pytest.raises(ValueError, match="expected one or more to join, found none"):
         cat([])
+
+
+MAKERS = {"Labels": Labels, "Joints": Joints, "Linear": lambda **state: linear(state)}
+
+
+def linear(state: dict[str, torch.Tensor]) -> nn.Linear:
+    made = nn.Linear(2, 3)
+    made.load_state_dict(state)
+    return made
+
+
+def through_json(record: object) -> Any:
+    """The record as it comes back from a file."""
+    tree, tensors = pack(record, MAKERS)
+    assert all(flat.ndim == 1 for flat in tensors.values())
+    return unpack(json.loads(json.dumps(tree)), tensors, MAKERS)
+
+
+def test_a_packed_record_comes_back() -> None:
+    module, some = nn.Linear(2, 3), labels(0, 3)
+    found = through_json([(some, module), 0.1, math.inf, 7, True, None, "word", []])
+    assert found[1:] == [0.1, math.inf, 7, True, None, "word", []]
+    (one, other) = found[0]
+    assert type(found[0]) is tuple
+    assert torch.equal(other.weight, module.weight)
+    assert one.camera_T_part is None
+    assert some.part is not None
+    assert some.joints is not None
+    assert torch.equal(one.part, some.part)
+    assert one.part.dtype == torch.int64
+    assert torch.equal(one.joints.axis, some.joints.axis)
+
+
+@pytest.mark.parametrize(
+    "tensor",
+    [
+        torch.arange(12.0).view(3, 4).mT,
+        torch.arange(24.0).view(2, 3, 4)[:, 1:, ::2],
+        torch.arange(3.0)[:, None].expand(3, 5),
+        torch.zeros(0, 3),
+        torch.tensor(2.0),
+        torch.tensor([True, False]),
+        torch.nn.Parameter(torch.ones(2)),
+    ],
+)
+def test_a_packed_tensor_keeps_values_and_strides(tensor: torch.Tensor) -> None:
+    found = through_json(tensor)
+    assert torch.equal(found, tensor)
+    assert found.dtype == tensor.dtype
+    assert found.stride() == tensor.stride()
+    assert not found.requires_grad
+
+
+def test_what_cannot_be_made_again_is_not_packed_nor_made() -> None:
+    with pytest.raises(TypeError, match="can be made again, found Observation"):
+        pack([Observation(points=torch.zeros(1, 3))], MAKERS)
+    tree, tensors = pack(labels(0, 3), MAKERS)
+    with pytest.raises(LookupError, match="Joints"):
+        unpack(tree, tensors, {"Labels": Labels})
+    name = tree["fields"]["part"]["tensor"]
+    with pytest.raises(LookupError, match=name):
+        unpack(tree, {}, MAKERS)
+    with pytest.raises(ValueError, match=r"expected a tensor of size \[3, 4\], found \(5,\)"):
+        unpack(tree, {**tensors, name: torch.zeros(5)}, MAKERS)

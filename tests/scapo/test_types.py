@@ -132,6 +132,7 @@ BAD: dict[str, tuple[type, dict[str, torch.Tensor]]] = {
 }
 
 
+@pytest.mark.usefixtures("shapes_checked")
 @pytest.mark.parametrize("kind", BAD)
 def test_wrong_shapes_and_types_raise_in_tests(kind: str) -> None:
     record, values = BAD[kind]
@@ -140,6 +141,7 @@ def test_wrong_shapes_and_types_raise_in_tests(kind: str) -> None:
     assert isinstance(caught.value, TypeCheckError) or kind == "no points"
 
 
+@pytest.mark.usefixtures("shapes_checked")
 @settings(max_examples=10, deadline=None)
 @given(count=st.integers(1, 4))
 def test_a_sample_joins_the_records(count: int) -> None:

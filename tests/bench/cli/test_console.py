@@ -4,16 +4,21 @@
 from __future__ import annotations
 
 import csv
+import io
 
 import pytest
+from rich.console import Console
 
 from bench import __main__ as program
 from bench.analysis.answered import read_answered
+from bench.cli import console as module
 from bench.figures.overlay import overlay_picture
 from bench.figures.pictures import ranking_picture
 from bench.requests import Request
+from scapo.method import Stage
 from scapo.store.files import read, write
 from scapo.store.predictions import write_predictions
+from scapo.training.fit import Progress
 from tests.helpers import made
 
 NAME = "[/x] :smile: [c] $\\frac{$"
@@ -79,3 +84,55 @@ def test_a_name_of_a_megabyte_is_refused_in_short(field, value, folder, tmp_path
     said = capsys.readouterr().err
     assert f"header field {field!r}" in said
     assert len(said) < 3000
+
+
+def heard(console: Console, monkeypatch: pytest.MonkeyPatch, steps: list[tuple[float, Progress]]):
+    """A training of which is heard at those seconds."""
+    now = [0.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
+    with module.stage_bars(console) as listener:
+        for seconds, step in steps:
+            now[0] = seconds
+            listener(step)
+
+
+def position(done: float, step: str = "", left: float | None = None) -> Progress:
+    stage = Stage(name="[/x] votes", epochs=2, lr=1.0)
+    loss = None if step else 0.5
+    return Progress(stage=stage, epoch=0, done=done, loss=loss, step=step, left=left)
+
+
+def test_a_log_has_a_line_of_progress_at_once_and_each_half_minute(monkeypatch):
+    steps = [
+        (0.0, position(0.0, "draw 1", 500.0)),
+        (20.0, position(0.1, "draw 2", 470.0)),
+        (40.0, position(0.2, "[c] draw 3", 65.0)),
+        (80.0, position(0.0)),
+        (100.0, position(0.25)),
+        (120.0, position(0.5)),
+    ]
+    out = io.StringIO()
+    heard(Console(file=out, width=100), monkeypatch, steps)
+    lines = out.getvalue().splitlines()
+    assert lines[:4] == [
+        "[/x] votes: draw 1, 0 % of the start, about 8 min 20 s left",
+        "[/x] votes: [c] draw 3, 20 % of the start, about 1 min 05 s left",
+        "[/x] votes, 0 %  loss 0.5000",
+        "[/x] votes, 50 %  loss 0.5000, about 0 min 40 s left",
+    ]
+    assert [line.split(" ━")[0].rstrip() for line in lines[4:]] == [
+        "[/x] votes: start",
+        "[/x] votes",
+    ]
+
+
+def test_a_terminal_has_a_bar_with_the_time_left(monkeypatch):
+    out = io.StringIO()
+    console = Console(file=out, width=90, force_terminal=True, color_system=None)
+    steps = [(0.0, position(0.4, "rung 1 of 2, template 1 of 3", 3725.0))]
+    heard(console, monkeypatch, steps)
+    last = next(line for line in reversed(out.getvalue().splitlines()) if "votes" in line)
+    assert "[/x] votes: rung 1 of 2, template 1 of 3" in last
+    assert "40.0 %" in last
+    assert "1:02:05" in last
+    assert "of the start" not in out.getvalue()

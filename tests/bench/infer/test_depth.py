@@ -99,8 +99,9 @@ def test_cameras_of_other_images_are_refused(text, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{", "JSON or YAML"), ("[1]", "a matrix K or fx"), ('{"K": [1, 2]}', "a matrix K or fx"),
-     ('{"fx": 1}', "a matrix K"), ('{"fx": "a", "fy": 1, "cx": 1, "cy": 1}', "a matrix K"),
+    [("{", "JSON or YAML"), ("[1]", "a matrix K or num"), ('{"K": [1, 2]}', "a matrix K or num"),
+     ('{"fx": 1}', r"found \['fx'\]"),
+     ('{"fx": NaN, "fy": 1, "cx": 1, "cy": 1}', r"found the values \['NaN', 1, 1, 1\]"),
      ("!!python/object/apply:os.system [ls]", "JSON or YAML")],
 )  # fmt: skip
 def test_files_that_are_no_camera_are_refused(text, message, tmp_path):

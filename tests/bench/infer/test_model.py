@@ -37,6 +37,8 @@ def test_released_models_answer_by_category(tmp_path, monkeypatch):
     assert found.category.name == "safe"
     with pytest.raises(StoreError, match="--category laptop: expected one of oven, safe; a run"):
         load_models(None, "laptop", "cpu", "fast")
+    with pytest.raises(StoreError, match=r"--run RUN; did you mean 'oven'\?$"):
+        load_models(None, "oevn", "cpu", "fast")
     with pytest.raises(StoreError, match="expected one of the two or none, found both"):
         load_models(Path("a"), "oven", "cpu", "fast")
 

@@ -274,6 +274,10 @@ def test_the_command(laptop, tmp_path, capsys):
     assert error.startswith("scapo-bench: ")
     assert run_program(*bad[:-1], tmp_path / "scores.csv") == 1
     assert "expected a name that ends in .csv.gz" in capsys.readouterr().err
+    for words in (["predict", "gone"], ["stability", "gone"], ["reference", "constant"]):
+        kind = ["--category", "laptop"] if words[0] == "reference" else []
+        assert run_program(*words, *kind, "--data", root(laptop), "--out", "p.txt") == 1
+        assert "p.txt: expected a name that ends in ." in capsys.readouterr().err
     assert run_program("evaluate", "--prediction", path) == 2
     assert run_program("nothing") == 2
     assert run_program() == 2

@@ -9,6 +9,7 @@ from bench.twin.record import Twin
 from scapo.categories import CATEGORIES
 
 
+@pytest.mark.usefixtures("shapes_checked")
 def test_a_record_refuses_shapes_that_do_not_fit():
     pose = np.eye(4)[None].repeat(2, 0)
     known = {

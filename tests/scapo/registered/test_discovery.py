@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from scapo.geometry.rigid import axis_angle
+from scapo.method import Journal
 from scapo.records import take
 from scapo.registered import discovery
 from scapo.registered.bundle_adjustment import Candidate, Inliers, densified, refit
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.discovery import advance, completed, held_out, leaders, mirrored
+from scapo.registered.course import Course
+from scapo.registered.discovery import advance, completed, held_out, mirrored, ranked
 from scapo.registered.initialisation import fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.pose_search import SearchResult
@@ -30,7 +32,7 @@ def test_the_joint_is_found_once_the_bases_are_in_one_frame():
     config = DiscoveryConfig(starts=2, rotations=300)
     tried = fitted_proposals(posed, ("revolute",), config, generator(0))
     assert len(tried) == 2
-    best = leaders(tried, take(views, torch.arange(0, 20, 5)), 1, config)[0]
+    best = tried[ranked(tried, take(views, torch.arange(0, 20, 5)), config)[0]]
     refit(best, config, generator(1), rounds=2)
     assert axis_angle(best.template.directions()[0].detach(), AXIS).rad2deg() < 12
     state = torch.corrcoef(torch.stack([best.inliers.placement.state[:, 0], truth.state[:, 0]]))[
@@ -50,8 +52,8 @@ def test_a_template_with_a_wrong_axis_is_not_the_leader():
     inliers = Inliers(views=views, placement=truth)
     config = DiscoveryConfig(rotations=300)
     tried = [Candidate(template=one, inliers=inliers) for one in (wrong, right)]
-    assert leaders(tried, views, 1, config)[0].template is right
-    assert leaders(tried[:1], views, 1, config)[0].template is wrong
+    assert ranked(tried, views, config) == [1, 0]
+    assert ranked(tried[:1], views, config) == [0]
 
 
 def test_views_that_judge_are_held_out():
@@ -81,14 +83,17 @@ def test_mirror_images_take_the_first_round_on_half_of_the_views(
         return best
 
     for name, step in {
-        "_of_draws": lambda *_: [first],
+        "common_frame": lambda *_: PosedViews(
+            views=views, rotation=truth.rotation, translation=truth.translation
+        ),
+        "fitted_proposals": lambda *_: [first],
         "completed": completing,
         "advance": advancing,
         "densified": lambda best, *_: best,
         "search_views": lambda *_: everywhere,
     }.items():
         monkeypatch.setattr(discovery, name, step)
-    tried = DiscoveryConfig(searched=12, trusted=(0.5, 0.7), heats=(0.3,), leans=False)
+    tried = DiscoveryConfig(draws=1, searched=12, trusted=(0.5, 0.7), heats=(0.3,), leans=False)
     expected = {
         True: [("advance", 6, 0.3), ("completed", 6, 4), ("advance", 12, 0.7)],
         False: [("advance", 6, 0.3), ("advance", 12, 0.5), ("advance", 12, 0.7)],
@@ -149,7 +154,8 @@ def test_the_mirror_image_that_completes_the_base_is_kept(
         views, (Inliers(views=views, placement=truth).cameras()[:, 1] > 0.2).nonzero()[:, 0]
     )
     config = DiscoveryConfig(rotations=200)
-    found = completed(start, judges, views, config, generator(0)).template
+    course = Course(("revolute",), generator(0), {}, Journal())
+    found = completed(start, judges, views, config, course).template
     assert "kept: 2" in caplog.text  # 0 as it was, then its image along x, y, z
     assert (found.normals[found.logit.argmax(-1) == 0, 1] > 0.8).sum() > 15
     assert anywhere == [False, True, True, True]

@@ -20,13 +20,15 @@ from scapo.registered.objects import (
     OneObject,
     agreeing,
     grouped,
-    known_objects,
     object_candidate,
+    one_object,
     owned_views,
     quarter_turns,
+    surest_first,
 )
 from scapo.registered.pose_search import Hypotheses, voted
 from scapo.registered.template import Placement
+from scapo.registered.view_states import Motion
 from scapo.types import Labels, Observation
 from tests.helpers.sighted import AXIS, sighted
 from tests.helpers.strategies import generator
@@ -47,6 +49,7 @@ def known(turn: torch.Tensor, seed: int, scores: tuple[float, float, float]) -> 
         ),
         moved=(moved,),
         proposals=(sorted(proposals, key=lambda one: -one.score),),
+        motions=(Motion(state=truth.state[:, 0], moved=moved, score=0.3, support=-0.2),),
         centre=torch.zeros(3),
         half=torch.full((3,), 0.3),
     )
@@ -150,7 +153,8 @@ def test_a_template_is_found_from_views_of_a_few_objects() -> None:
     some = [sighted(8, seed=50 * k) for k in range(4)]
     config = DiscoveryConfig(rotations=300, template_points=150)
     with_truth = {tuple(v.points[i, 0].tolist()): t.rotation[i] for v, t in some for i in range(8)}
-    shown = known_objects([v for v, _ in some], ("revolute",), config, generator(0))
+    g = generator(0)
+    shown = surest_first([one_object(views, ("revolute",), config, g) for views, _ in some])
     found = object_candidate(shown, ("revolute",), config, generator(0))
     views, placement = found.inliers.views, found.inliers.placement
     truth = torch.stack([with_truth[tuple(p.tolist())] for p in views.points[:, 0]])

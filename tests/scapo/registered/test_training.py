@@ -6,21 +6,25 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 import torch
 
 from scapo.categories import CATEGORIES
+from scapo.method import Journal
 from scapo.predictor import load
+from scapo.registered import discovery
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig
-from scapo.registered.discovery import discover
+from scapo.registered.discovery import Discovery, discover
 from scapo.registered.method import TemplateRegistration
 from scapo.store.samples import TrainingData
 from scapo.training import fit
+from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation
 from tests.helpers.sighted import sighted
 from tests.helpers.strategies import generator
-from tests.scapo.training.test_fit import same
+from tests.scapo.training.test_fit import InterruptedRunError, same
 
 DISCOVERY = DiscoveryConfig(
     seeds=12, rotations=200, searched=12, trusted=(0.9,), starts=3, draws=1, heats=(), judged=4,
@@ -69,12 +73,31 @@ def test_a_template_is_found_learned_and_stored(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_same_views_give_the_same_template() -> None:
-    """Of few views, which tell no joint: the steps are those of a discovery."""
+def test_the_same_views_give_the_same_template_interrupted_or_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of few views, which tell no joint: the steps are those of a discovery, and real."""
+
+    def interrupted(*_: object) -> NoReturn:
+        raise InterruptedRunError
+
+    def found(journal: Journal) -> Discovery:
+        return discover(views, ("revolute",), few, generator(3), (), journal)
+
+    def stored() -> StoredJournal:
+        return StoredJournal(tmp_path, {}, "votes", lambda *_: None)
+
     few = replace(DISCOVERY, seeds=6, searched=8, judged=2, starts=1, leans=False,
                   template_points=60, final_points=80)  # fmt: skip
     views, _ = sighted(10, seed=80)
-    one, other = (discover(views, ("revolute",), few, generator(3)) for _ in range(2))
+    one = found(Journal())
+    with monkeypatch.context() as patch:
+        patch.setattr(discovery, "densified", interrupted)
+        with pytest.raises(InterruptedRunError):
+            found(stored())
+    for step in ("common_frame", "fitted_proposals", "advance"):
+        monkeypatch.setattr(discovery, step, interrupted)  # none of them is done again
+    other = found(stored())
     for name, value in one.template.state_dict().items():
         assert torch.equal(value, other.template.state_dict()[name]), name
     assert torch.equal(one.found.loss, other.found.loss)

@@ -17,7 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scapo.store.files import canonical_json, read, sha256_file, write, write_bytes
+from scapo.store.files import (
+    canonical_json,
+    read,
+    require_suffix,
+    sha256_file,
+    write,
+    write_bytes,
+)
+from scapo.store.schema import StoreError
 from tests.conftest import REPOSITORY
 
 HEADER = {"format": "scapo-test/1", "list": [1, 2.5, None], "text": "Größe 尺"}
@@ -142,6 +150,13 @@ def test_a_writer_killed_before_the_rename_leaves_no_file(
     assert [Path(name).suffix for name in left] == [".tmp"]
     write_bytes(path, b"whole")  # and does not stand in the way of the next
     assert path.read_bytes() == b"whole"
+
+
+@pytest.mark.parametrize("name", ["p.csv", "p", ".safetensors", "p.safetensors.txt"])
+def test_a_name_that_does_not_say_what_is_in_the_file_is_refused(name: str) -> None:
+    require_suffix(Path("p.safetensors"), ".safetensors")
+    with pytest.raises(StoreError, match=f"expected a name that ends in .safetensors, .*{name}'"):
+        require_suffix(Path("folder") / name, ".safetensors")
 
 
 def test_canonical_json_ignores_the_order_of_keys() -> None:

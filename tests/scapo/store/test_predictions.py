@@ -111,7 +111,7 @@ def test_the_digest_has_three_names(split, tmp_path, key):
 
 
 def test_a_missing_file(split, tmp_path):
-    with pytest.raises(StoreError, match="expected a file, found none"):
+    with pytest.raises(StoreError, match="expected a file, found none; `scapo-bench predict"):
         Predictions(tmp_path / "none.safetensors", split)
 
 

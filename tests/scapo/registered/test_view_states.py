@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: MIT
+"""States of views of one object from pairs of them, and which points have them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from scapo.registered.joint_proposals import JointProposal, PosedViews
+from scapo.registered.view_states import motion_of, synchronised_states
+from tests.helpers.sighted import AXIS, PIVOT, sighted
+from tests.helpers.strategies import generator
+
+JOINT = JointProposal(axis=AXIS, pivot=PIVOT, score=1.0)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_states_are_those_whose_differences_score_most(wrong: float) -> None:
+    """Peaks at the true differences; in some pairs a higher one elsewhere."""
+    g, count, most = generator(0), 12, 24
+    true = torch.randint(0, most, (count,), generator=g)
+    off = true - true[:, None]
+    table = 0.2 * torch.rand(count, count, 2 * most + 1, generator=g)
+    table.scatter_(2, off[..., None] + most, 1.0)
+    elsewhere = torch.randint(0, 2 * most + 1, (count, count, 1), generator=g)
+    misled = (torch.rand(count, count, 1, generator=g) < wrong).float()
+    table.scatter_add_(2, elsewhere, 1.5 * misled)
+    state, score = synchronised_states(table, 0.5)
+    assert torch.equal(state - state[0], 0.5 * (true - true[0]))
+    assert score > 0.9
+
+
+def test_the_flap_and_its_states_are_found_where_its_hinge_is_known() -> None:
+    views, truth = sighted(12, seed=7)
+    scene = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
+    points, _ = scene.world(128)
+    inside = ((points - torch.tensor([0.0, 0, 0])).abs() < torch.tensor([0.21, 0.29, 0.17])).all(-1)
+    anything = torch.rand(inside.shape, generator=generator(1)) < 0.1
+    found = motion_of(scene, ~inside | anything, JOINT, "revolute")
+    true = truth.state[:, 0] - truth.state[:, 0].mean()
+    assert float((found.state - found.state.mean() - true).abs().median()) < 0.08
+    assert float((found.moved & ~inside).sum() / found.moved.sum()) > 0.8
+    assert 0.3 < found.score <= 1
+    back, _ = found.back(scene, JOINT, "revolute")
+    flap = back[found.moved & ~inside] - PIVOT
+    assert float(torch.linalg.svdvals(flap)[-1] / len(flap) ** 0.5) < 0.03  # flat, as it is
+    moving = points[found.moved & ~inside] - PIVOT
+    assert float(torch.linalg.svdvals(moving)[-1] / len(moving) ** 0.5) > 0.05
