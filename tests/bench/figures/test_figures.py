@@ -199,7 +199,6 @@ def test_templates_of_both_methods() -> None:
     np.testing.assert_allclose(np.quantile(base, [0.02, 0.98], axis=0).mean(0), 0, atol=1e-5)
 
 
-@torch.no_grad()
 def test_a_template_in_the_objects_frame_moves_as_the_category_says() -> None:
     own = convention((1, 0), np.random.default_rng(4))
     shape, category = hinge(), CATEGORIES["oven"]
@@ -215,6 +214,7 @@ def test_a_template_in_the_objects_frame_moves_as_the_category_says() -> None:
     np.testing.assert_allclose(found.axis, own.sign[0] * shape.axis @ base[:3, :3].T, atol=1e-12)
 
 
+@torch.no_grad()
 def test_a_template_whose_hinges_lean_is_drawn_from_their_rest() -> None:
     method = TemplateRegistration(RegisteredConfig(), category("laptop"), generator(0))
     template, g = method.template, generator(1)
