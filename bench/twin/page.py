@@ -28,8 +28,9 @@ from scapo.drawing import BACKGROUND as BACKGROUND_COLOR
 from scapo.drawing import PART_COLORS
 from scapo.store import write_bytes
 
-MAX_POINTS = 20_000
-"""Of a cloud that are shown; more are thinned evenly."""
+MAX_POINTS = 2_000
+"""Of a cloud that are shown: of more so many, drawn at random, since dense ones would hide the
+parts that the sliders move."""
 MAX_DOWNLOAD = 20 * 1024 * 1024
 """Bytes of a file that the page carries; larger ones are named."""
 SEEN = (0.02, 0.98)
@@ -195,8 +196,8 @@ def _zip(paths: Sequence[Path]) -> bytes:
 def _geometry(twin: Twin, made: Articulated) -> dict[str, Any]:
     """What `page.js` draws, as observed, in the camera's frame."""
     parts = [_part(twin, made, part) for part in range(len(made.links))]
-    cloud = twin.points[_evenly(len(twin.points))]
-    label = twin.part[_evenly(len(twin.points))]
+    cloud = twin.points[_drawn(len(twin.points))]
+    label = twin.part[_drawn(len(twin.points))]
     low, high = np.quantile(cloud[label != BACKGROUND] if (label != BACKGROUND).any() else cloud,
                             SEEN, axis=0)  # fmt: skip
     centre, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-3)
@@ -224,8 +225,8 @@ def _geometry(twin: Twin, made: Articulated) -> dict[str, Any]:
     }
 
 
-def _evenly(count: int) -> np.ndarray:
-    return np.linspace(0, count - 1, min(count, MAX_POINTS)).astype(int)
+def _drawn(count: int) -> np.ndarray:
+    return np.random.default_rng(0).permutation(count)[:MAX_POINTS]  # no stripes of a raster
 
 
 def _part(twin: Twin, made: Articulated, part: int) -> dict[str, Any]:

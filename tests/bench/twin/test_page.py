@@ -86,6 +86,20 @@ def test_equal_twins_give_equal_pages_and_large_files_are_named_only(
     assert json.loads(download(page, "twin.json"))["category"] == "safe"
 
 
+def test_of_a_dense_cloud_few_points_hide_what_moves(
+    twin: Twin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shown = len(twin.points) // 3
+    monkeypatch.setattr("bench.twin.page.MAX_POINTS", shown)
+    page = write_page(twin, tmp_path / "dense.html").read_text()
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
+    assert found is not None
+    clouds = json.loads(found[1])["clouds"]
+    count = [len(base64.b64decode(cloud["points"])) // 12 for cloud in clouds]
+    assert sum(count) == shown
+    assert len(count) == len(np.unique(twin.part))
+
+
 def test_names_from_outside_are_text(twin: Twin, tmp_path: Path):
     """Also where they look like a field of the template, or end the script."""
     odd = replace(
