@@ -139,6 +139,9 @@ class PredictRequest(RunRequest):
     limit: int | None = None
     """Predict so many clouds alone, evenly spread over the split (500 are enough to calibrate);
     the others have no answer in the file."""
+    own_frame: bool = False
+    """Leave poses, order of parts and states as a method that saw no poses has them, and not in
+    the object's frame, where its checkpoint knows that."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

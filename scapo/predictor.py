@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scapo.alignment import Alignment, unit_length
 from scapo.categories import CATEGORIES
 from scapo.method import AbstractMethod, Mode
 from scapo.records import map_tensors
 from scapo.registry import load_method
+from scapo.store.checkpoint import check_header
 from scapo.store.schema import StoreError
 from scapo.text import did_you_mean
 from scapo.types import Observation, Prediction
@@ -39,10 +41,24 @@ class Predictor:
     (torch.Size([3, 100, 2]), torch.Size([3, 1, 3]), torch.Size([3, 2, 4, 4]))
     """
 
-    def __init__(self, model: AbstractMethod, device: str) -> None:
-        """Hold the model in eval mode on the device."""
+    def __init__(
+        self, model: AbstractMethod, device: str, alignment: Alignment | None = None
+    ) -> None:
+        """Hold the model in eval mode on the device.
+
+        Args:
+            model: Of one category.
+            device: Where it runs.
+            alignment: What brings its answers to the object's frame; None where it learned that
+                frame itself, or nobody knows it.
+        """
         self.model = model.to(device).eval()
-        self.device = device
+        self.device, self.alignment = device, alignment
+
+    @property
+    def in_object_frame(self) -> bool:
+        """Whether poses, order of parts and states are the category's, not the method's own."""
+        return self.alignment is not None or "pose" in self.model.supervision
 
     def predict(
         self,
@@ -50,8 +66,13 @@ class Predictor:
         mode: Mode = "fast",
         sensor: np.ndarray | Tensor | None = None,
         color: np.ndarray | Tensor | None = None,
+        *,
+        own_frame: bool = False,
     ) -> Prediction:
         """Parts, poses and joints of one cloud or of several.
+
+        A part's pose maps the object's frame at rest (z up, the front towards -x) to the camera,
+        where `in_object_frame`; else a frame that the method found for itself.
 
         Args:
             points: (..., N, 3), camera frame, metres, numpy or torch.
@@ -59,6 +80,7 @@ class Predictor:
             sensor: (..., 3), centre of the camera, metres, for clouds in another frame than the
                 camera's. What `refine` of a `registered` model uses.
             color: (..., N, 3), in [0, 1], for methods that look at it.
+            own_frame: Answer in the method's own frames, order of parts and states.
 
         Returns:
             Tensors on the CPU with the same leading dimensions; `np.asarray` takes them as they
@@ -96,7 +118,15 @@ class Predictor:
             sensor=centre,
         )
         prediction = self.model.predict(observation, mode)
+        if not own_frame:
+            prediction = self._in_object_frame(prediction, observation)
         return map_tensors(prediction, lambda one: one.reshape((*shape, *one.shape[1:])).cpu())
+
+    def _in_object_frame(self, prediction: Prediction, observation: Observation) -> Prediction:
+        if self.alignment is None:
+            return prediction
+        unit = unit_length(observation.points)
+        return self.alignment.apply(prediction, unit, self.model.category)
 
     def _tensor(self, values: np.ndarray | Tensor) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)
@@ -114,7 +144,9 @@ def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
     Raises:
         StoreError: There is no checkpoint of a method that is known here.
     """
-    return Predictor(load_method(find(path_or_category))[0], device)
+    path = find(path_or_category)
+    method, header = load_method(path)
+    return Predictor(method, device, check_header(header, str(path)).alignment)
 
 
 def find(path_or_category: str | Path) -> Path:

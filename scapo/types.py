@@ -90,7 +90,10 @@ class Sample:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """What a method says of a cloud. Part frames are the method's own unless it was supervised."""
+    """What a method says of a cloud.
+
+    Part frames are the method's own, unless it saw true poses or an `Alignment` was applied.
+    """
 
     part_weight: Float[Tensor, "*B N P"]
     """Rows on the simplex; a hard segmentation is one-hot."""

@@ -65,7 +65,9 @@ class Evaluate(requests.EvaluateRequest):
         from bench.scoring.score_files import side_file
 
         report, beside = evaluate_beside(self)
-        if self.calibration is None and "pose" not in report["supervision"]:
+        if self.calibration is None and (at := report["calibration"]) is not None:
+            say(console, f"Calibrated at training, on {at['samples']} clouds of {at['split']}.")
+        elif self.calibration is None and "pose" not in report["supervision"]:
             say(console, "No --calibration: part poses are compared as given.")
         console.print(summary_table(report))
         say(console, f"Scores: {self.out}")

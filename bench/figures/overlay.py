@@ -68,7 +68,7 @@ def caption(answered: Answered, samples: Int[np.ndarray, " K"]) -> str:
     error = error[np.isfinite(error)]
     words = plain(f"{answered.header.method} {answered.header.variant}".strip())
     first = f"{words}: {len(samples)} {plain(answered.header.category)} clouds in one frame"
-    if answered.fitted.frames.offsets is None and "pose" not in answered.header.supervision:
+    if answered.fitted.record is None and "pose" not in answered.header.supervision:
         return f"{first} (not calibrated)"
     share = 100 * float((error <= 15).mean()) if len(error) else float("nan")
     return (

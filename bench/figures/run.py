@@ -11,12 +11,18 @@ import numpy as np
 from bench.analysis.answered import Answered, read_answered
 from bench.figures.overlay import overlay_picture
 from bench.figures.pictures import ranking_picture, training_curve
-from bench.figures.template import template_picture, template_shape
+from bench.figures.template import (
+    TemplateShape,
+    aligned_shape,
+    template_picture,
+    template_shape,
+)
 from bench.methods import load
 from bench.requests import PicturesRequest, Request
 from bench.run_files import METRICS
 from scapo.method import AbstractMethod, evenly
 from scapo.store import StoreError
+from scapo.store.checkpoint import check_header
 from scapo.store.files import Header
 
 
@@ -37,7 +43,11 @@ def draw_pictures(request: PicturesRequest) -> Iterator[str]:
         )
     )
     check_same(request.predictions, answered, header)
-    for name, draw in _figures(request, method, answered).items():
+    shape = template_shape(method)
+    if shape is not None and answered.header.object_frame is not None:
+        known = check_header(header, str(request.checkpoint)).alignment
+        shape = None if known is None else aligned_shape(shape, known, method.category)
+    for name, draw in _figures(request, method, answered, shape).items():
         if isinstance(draw, str):
             yield f"{name}: {draw}"
             continue
@@ -46,14 +56,16 @@ def draw_pictures(request: PicturesRequest) -> Iterator[str]:
 
 
 def _figures(
-    request: PicturesRequest, method: AbstractMethod, answered: Answered
+    request: PicturesRequest,
+    method: AbstractMethod,
+    answered: Answered,
+    shape: TemplateShape | None,
 ) -> dict[str, Callable[[Path], None] | str]:
     """File name -> what draws it, or why it is left out."""
     run = request.checkpoint if request.checkpoint.is_dir() else request.checkpoint.parent
     samples = evenly(len(answered.points), request.clouds).numpy()
     posed = bool(np.isfinite(answered.mine.pose).any())
     moved = bool(np.isfinite(answered.mine.state).any())
-    shape = template_shape(method)
     out: dict[str, Callable[[Path], None] | str] = {
         "overlay.png": "left out, the predictions hold no poses",
         "template.png": f"left out, {method.name} has no template or says no joint states",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -29,8 +29,11 @@ from bench.figures.drawing import (
     transform,
     window,
 )
+from scapo.alignment import Alignment
+from scapo.categories import Category
 from scapo.geometry import rigid as geometry
 from scapo.method import AbstractMethod
+from scapo.types import Joints, Prediction
 
 if TYPE_CHECKING:
     from scapo.paper.method import Scapo
@@ -106,6 +109,34 @@ def carried(shape: TemplateShape, pose: Float[np.ndarray, "4 4"]) -> TemplateSha
     )
 
 
+def aligned_shape(shape: TemplateShape, alignment: Alignment, category: Category) -> TemplateShape:
+    """The shape by the category's conventions: at rest, in the object's frame, parts in order."""
+    place = torch.eye(4, dtype=torch.float64).expand(shape.weight.shape[1], 4, 4)
+    joints = Joints(
+        pivot=torch.from_numpy(shape.pivot),
+        axis=torch.from_numpy(shape.axis),
+        state=torch.zeros(len(shape.pivot), dtype=torch.float64),
+    )
+    said = Prediction(
+        part_weight=torch.from_numpy(shape.weight),
+        camera_T_part=place,
+        joints=joints,
+        canonical_points=torch.from_numpy(shape.points),
+        canonical_normals=None if shape.normals is None else torch.from_numpy(shape.normals),
+        canonical_part=torch.from_numpy(shape.weight.argmax(-1)),
+    )
+    found = alignment.apply(said, torch.ones((), dtype=torch.float64), category)
+    pose, own = cast("Any", found.camera_T_part)[0], cast("Any", found.joints)
+    turn, normals = pose[:3, :3], found.canonical_normals
+    return TemplateShape(
+        points=_plain(cast("Any", found.canonical_points)),
+        weight=_plain(found.part_weight),
+        pivot=_plain((own.pivot - pose[:3, 3]) @ turn),
+        axis=_plain(own.axis @ turn),
+        normals=None if normals is None else _plain(normals),
+    )
+
+
 def at_states(
     shape: TemplateShape, state: Float[np.ndarray, " J"], revolute: np.ndarray
 ) -> TemplateShape:
@@ -140,6 +171,12 @@ def template_picture(
     """Columns: three states; rows: from the front above and from the side.
 
     The frame is the true one where the predictions were calibrated, else the method's own.
+
+    Args:
+        answered: Predictions beside the truth.
+        shape: By the conventions of the predictions.
+        predictions: Their file.
+        out: PNG.
     """
     offsets = answered.fitted.frames.offsets
     if offsets is not None and np.isfinite(offsets[0]).all():

@@ -1,29 +1,27 @@
 # SPDX-License-Identifier: MIT
 """What a model says of an object's cloud, as a `Twin`, and what speaks for and against it.
 
-A model that saw no labels has part frames, an order of parts and states of its own; where it was
-calibrated on labelled clouds (`calibration`) they are brought to those of the category.
+A model that saw no labels has part frames, an order of parts and states of its own; where labelled
+clouds told (`scapo.alignment`) they are brought to those of the category.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-from bench.infer.alignment import Alignment, Parts, aligned
 from bench.infer.cloud import LEAST_POINTS, Cloud, InputError
 from bench.infer.model import Model
+from bench.infer.parts import Parts
 from bench.matching import rotation_degrees
 from bench.requests import Mode
 from bench.twin.record import BACKGROUND, Shape, Twin
 from scapo.categories import Category
 from scapo.geometry.points import normalise
-from scapo.geometry.rigid import joint_motion
 from scapo.registered.outliers import inlier_mask
 from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.view_loss import view_loss
@@ -62,12 +60,10 @@ def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
     """
     drawn = _draw(cloud)
     found = model.predictor.predict(drawn.points, mode, cloud.sensor)
-    alignment = model.alignment()
-    size = mean_radius(drawn.points)
-    parts = aligned(_parts(name, found, model.category), alignment, 4 * size, model.category)
-    label = np.where(drawn.inlier, alignment.relabel(_labels(found)), BACKGROUND)
+    parts = _parts(name, found, model.category)
+    label = np.where(drawn.inlier, _labels(found), BACKGROUND)
     near = KDTree(drawn.points).query(cloud.points)[1]
-    shape = _shape(found, model.category, alignment)
+    shape = _shape(found)
     own = drawn.points[drawn.inlier]
     pivot = _near_parts(parts, own, label[drawn.inlier], model.category)
     limits, words = _limits(parts, model)
@@ -102,11 +98,7 @@ def agreement(cloud: Cloud, twin: Twin, model: Model, mode: Mode) -> Twin:
     draws = [cloud.points[rng.choice(len(cloud.points), count, replace=False)]
              for _ in range(RESAMPLES)]  # fmt: skip
     found = model.predictor.predict(np.stack(draws), mode, cloud.sensor)
-    others = []
-    for draw, k in zip(draws, range(RESAMPLES), strict=True):
-        parts = _parts(twin.name, _row(found, k), model.category)
-        unit = 4 * mean_radius(draw)
-        others.append(aligned(parts, model.alignment(), unit, model.category))
+    others = [_parts(twin.name, _row(found, k), model.category) for k in range(RESAMPLES)]
     poses = np.stack([one.camera_T_part[:, :3, :3] for one in others])
     turn = rotation_degrees(poses, np.broadcast_to(twin.camera_T_part[:, :3, :3], poses.shape))
     cosine = np.abs((np.stack([one.axis for one in others]) * twin.axis).sum(-1)).clip(0, 1)
@@ -138,11 +130,6 @@ def residual(
     placed = similarity.forward(torch.as_tensor(shape.points, dtype=torch.float32)[None])
     normals = torch.as_tensor(shape.normals, dtype=torch.float32)[None]
     return float(view_loss(views, (placed, normals), RANKED, BACKWARD))
-
-
-def mean_radius(points: Float[np.ndarray, "K 3"]) -> float:
-    """Mean distance of points from their centroid, metres."""
-    return float(np.linalg.norm(points - points.mean(0), axis=1).mean())
 
 
 def _draw(cloud: Cloud) -> _Drawn:
@@ -188,23 +175,15 @@ def _parts(name: str, found: Prediction, category: Category) -> Parts:
     )
 
 
-def _shape(found: Prediction, category: Category, alignment: Alignment) -> Shape | None:
+def _shape(found: Prediction) -> Shape | None:
     """The canonical shape, its parts moved to where they are observed."""
     shape, normals, part = found.canonical_points, found.canonical_normals, found.canonical_part
-    if shape is None or normals is None or part is None:
+    if shape is None or normals is None or part is None or found.camera_T_part is None:
         return None
-    joints = cast("Any", found.joints)
-    base = cast("torch.Tensor", found.camera_T_part)[0]
-    poses = [base]
-    for j, spec in enumerate(category.joints):
-        motion = joint_motion(joints.pivot[j], joints.axis[j], joints.state[j], spec.kind)
-        poses.append(motion @ base)
-    pose = torch.stack(poses)[part]  # (M, 4, 4)
+    pose = found.camera_T_part[part]  # (M, 4, 4)
     placed = (pose[:, :3, :3] @ shape[..., None])[..., 0] + pose[:, :3, 3]
     turned = (pose[:, :3, :3] @ normals[..., None])[..., 0]
-    return Shape(
-        points=placed.numpy(), normals=turned.numpy(), part=alignment.relabel(part.numpy())
-    )
+    return Shape(points=placed.numpy(), normals=turned.numpy(), part=part.numpy())
 
 
 def _near_parts(
@@ -229,9 +208,9 @@ def _limits(parts: Parts, model: Model) -> tuple[Float[np.ndarray, "J 2"], tuple
     """
     words = []
     limits = np.array([[spec.lower, spec.upper] for spec in model.category.joints])
-    if not model.is_aligned and parts.limits is not None:
+    if not model.predictor.in_object_frame and parts.limits is not None:
         limits = parts.limits
-    elif not model.is_aligned:
+    elif not model.predictor.in_object_frame:
         limits = limits - limits.mean(1, keepdims=True) + parts.state[:, None]
         words.append("joint limits are a guess: the method knows neither rest nor range")
     wide = np.stack(

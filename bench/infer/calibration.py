@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
 """What labelled clouds taught about a model's answers, as a JSON file beside its checkpoint.
 
-`alignment` brings its frames to the category's; `joint` and `part` turn what speaks for an answer
-into the probability that it is right: a logistic map of three numbers whose weights cannot have the
-wrong sign. `reliability` says how true such probabilities were of objects not fitted to.
+`alignment` brings its frames to the category's where the checkpoint does not; `joint` and `part`
+turn what speaks for an answer into the probability that it is right: a logistic map of three
+numbers whose weights cannot have the wrong sign. `reliability` says how true such probabilities
+were of objects not fitted to.
 """
 
 from __future__ import annotations
@@ -12,18 +13,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from math import exp, log, log1p
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from bench.infer.alignment import Alignment
 from bench.requests import Mode
 from bench.twin.record import Twin
+from scapo.alignment import Alignment
 from scapo.store.files import canonical_json, write_bytes
 from scapo.store.json_records import from_json, read_json
 from scapo.store.schema import StoreError
 
-FORMAT = "scapo-calibration/1"
+FORMAT, OF_BEFORE = "scapo-calibration/2", "scapo-calibration/1"
 FEATURES = ("residual", "margin", "spread")
 SIGNS = (-1.0, 1.0, -1.0)
 """Of the weights: a larger residual or spread cannot speak for an answer."""
@@ -80,7 +82,8 @@ class Calibration:
     data: str
     """Digest of the labelled data."""
     samples: int
-    alignment: Alignment
+    alignment: Alignment | None
+    """None: the checkpoint has one, or learned poses from labels."""
     joint: tuple[LogisticMap, ...]
     """That the direction of each joint's axis is within 5 degrees."""
     part: tuple[LogisticMap, ...]
@@ -107,8 +110,12 @@ def read_calibration(path: Path, digest: str) -> Calibration:
         StoreError: Of another checkpoint, or no calibration.
     """
     record = read_json(path)
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise StoreError(f"{path}: expected {FORMAT}, found something else")
+    if not isinstance(record, dict) or record.get("format") not in (FORMAT, OF_BEFORE):
+        raise StoreError(
+            f"{path}: expected {FORMAT}, found something else: scapo-bench calibrate makes it anew"
+        )
+    if record["format"] == OF_BEFORE:
+        record = {**record, "alignment": _of_before(record)}
     found: Calibration = from_json(
         Calibration, {k: v for k, v in record.items() if k != "format"}, str(path)
     )
@@ -118,6 +125,19 @@ def read_calibration(path: Path, digest: str) -> Calibration:
             f"that of {found.model[:12]}: scapo-bench calibrate makes it anew"
         )
     return found
+
+
+def _of_before(record: dict[str, Any]) -> object:
+    """The alignment of a file of before: one offset, of the base, from which joints move the rest.
+
+    Here children follow the base too (`bench.infer.parts`), so that it may stand for every part.
+    """
+    known = record.get("alignment")
+    if not isinstance(known, dict) or not isinstance(known.get("order"), list):
+        return known
+    clouds = {"split": record.get("split"), "data_digest": record.get("data"),
+              "samples": record.get("samples"), "mode": record.get("mode")}  # fmt: skip
+    return {**known, "own_T_part": [known.get("base")] * len(known["order"]), "clouds": clouds}
 
 
 def feature(evidence: Mapping[str, float], kind: str, index: int) -> tuple[float, ...] | None:

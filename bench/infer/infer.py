@@ -129,7 +129,7 @@ def answer(name: str, cloud: Cloud, models: Sequence[Model], mode: Mode, given: 
         choice=choice,
         mode=mode,
         uncalibrated=reason,
-        aligned=models[best].is_aligned,
+        aligned=models[best].predictor.in_object_frame,
         frame="input" if away else "camera",
     )
 

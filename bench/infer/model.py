@@ -6,13 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from bench.infer.alignment import Alignment
 from bench.infer.calibration import Calibration, calibration_file, read_calibration
 from bench.methods import load
 from bench.requests import Mode
 from scapo.categories import Category
 from scapo.predictor import Predictor, find, released
-from scapo.store.checkpoint import WEIGHTS
+from scapo.store.checkpoint import WEIGHTS, check_header
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
 from scapo.text import did_you_mean
@@ -32,17 +31,6 @@ class Model:
     calibration: Calibration | None
     """Of one mode; None: it was not calibrated for that."""
 
-    @property
-    def is_aligned(self) -> bool:
-        """Whether its frames, order of parts and states are the category's."""
-        return self.calibration is not None or "pose" in self.predictor.model.supervision
-
-    def alignment(self) -> Alignment:
-        """From its own conventions to the category's."""
-        if self.calibration is None:
-            return Alignment.none(self.category)
-        return self.calibration.alignment
-
 
 def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
     """The model of a run folder, a checkpoint file or a category.
@@ -60,13 +48,17 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
     method, header = load(path)
     digest = sha256_file(file)
     beside = None if mode is None else calibration_file(file, mode)
+    known = read_calibration(beside, digest) if beside and beside.is_file() else None
+    alignment = check_header(header, str(file)).alignment
+    if alignment is None and known is not None:
+        alignment = known.alignment
     return Model(
         name=file.resolve().parent.name if file.name == WEIGHTS else file.stem,
-        predictor=Predictor(method, device),
+        predictor=Predictor(method, device, alignment),
         category=method.category,
         method=header["method"],
         digest=digest,
-        calibration=read_calibration(beside, digest) if beside and beside.is_file() else None,
+        calibration=known,
     )
 
 

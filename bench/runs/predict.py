@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,18 @@ from bench.methods import find, load
 from bench.requests import PredictRequest
 from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
+from bench.scoring.scores import to_arrays
+from scapo.alignment import Alignment, ObjectFrame, unit_length
 from scapo.method import AbstractMethod, OracleMethod, evenly
 from scapo.records import map_tensors
 from scapo.store import Split, open_split
-from scapo.store.checkpoint import require_fields
+from scapo.store.checkpoint import check_header, require_fields
 from scapo.store.definitions import foreign
 from scapo.store.files import Arrays, require_suffix
 from scapo.store.files import Header as StoredHeader
 from scapo.store.predictions import Header, write_predictions
 from scapo.store.provenance import machine
 from scapo.store.samples import SampleDataset, label, observe, observed
-from scapo.types import Prediction
 
 RUN_FIELDS = ("commit", "config", "data_digest", "machine", "seed", "training")
 """Of the checkpoint's header, handed on to scores and tables."""
@@ -56,6 +58,8 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     require_fields(header, ("seed", "steps"), request.checkpoint)
     device = pick_device(request.device)
     method.to(device)
+    known = check_header(header, str(request.checkpoint)).alignment
+    alignment = None if request.own_frame else known
     oracle = _oracle_words(method) if request.oracle else []
     split = open_split(request.data, header["category"], request.split)
     samples = SampleDataset(split, observed(split))
@@ -65,7 +69,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     for index in watch(chosen.split(request.batch)):
         batch = samples.batch(index)
         started = time.perf_counter()
-        parts.append(_answer(request, method, batch, device))  # waits for the device
+        parts.append(_answer(request, method, batch, device, alignment))  # waits for the device
         seconds += time.perf_counter() - started
     words = [method.variant, "" if request.mode == "fast" else request.mode, *oracle]
     budget = {
@@ -78,6 +82,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         "seconds_per_cloud": round(seconds / len(chosen), 6),
     }
     made = _made(method, header, "-".join(word for word in words if word), split, budget)
+    made = replace(made, object_frame=ObjectFrame.of(alignment))
     write_predictions(request.out, made, joined(parts, chosen.numpy(), len(samples)))
     return len(chosen), seconds / len(chosen)
 
@@ -125,13 +130,17 @@ def _answer(
     method: AbstractMethod,
     samples: dict[str, torch.Tensor],
     device: str,
+    alignment: Alignment | None,
 ) -> Arrays:
     """The tensors of a predictions file for some samples."""
     batch = map_tensors(samples, lambda tensor: tensor.to(device))
     observation = observe(batch)
     if request.oracle and isinstance(method, OracleMethod):
         return to_arrays(method.predict_given(observation, label(batch).keep(method.oracle)))
-    return to_arrays(method.predict(observation, request.mode))
+    found = method.predict(observation, request.mode)
+    if alignment is not None:
+        found = alignment.apply(found, unit_length(observation.points), method.category)
+    return to_arrays(found)
 
 
 def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -> Arrays:
@@ -152,23 +161,3 @@ def timing(run: Path) -> dict[str, Any]:
     if not (folder / TIMING).is_file():
         return {}
     return {"training_seconds": round(read_timing(folder).seconds, 1)}
-
-
-def to_arrays(prediction: Prediction) -> Arrays:
-    """The tensors of a predictions file; what the method does not say is left out."""
-    joints = prediction.joints
-    tensors = {
-        "part_weight": prediction.part_weight,
-        "camera_T_part": prediction.camera_T_part,
-        "joint_pivot": None if joints is None else joints.pivot,
-        "joint_axis": None if joints is None else joints.axis,
-        "joint_state": None if joints is None else joints.state,
-        "canonical_points": prediction.canonical_points,
-        "confidence_sample": prediction.confidence,
-        **{f"record_{name}": tensor for name, tensor in (prediction.record or {}).items()},
-    }
-    return {
-        name: tensor.detach().cpu().numpy().astype(np.float32)
-        for name, tensor in tensors.items()
-        if tensor is not None
-    }

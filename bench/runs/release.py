@@ -18,11 +18,20 @@ import torch
 
 from bench.methods import find, load
 from bench.requests import ReleaseRequest
+from bench.runs.align import CLOUDS, MODE, aligned
 from bench.scoring.score_files import SUFFIX, Report, read_report
+from bench.tables.model import UNCALIBRATED, UNCALIBRATED_NOTE
 from scapo.method import AbstractMethod, Mode, evenly
 from scapo.predictor import Predictor
 from scapo.store import Header, StoreError, open_split, sha256_file, write, write_bytes
-from scapo.store.checkpoint import RUN_FIELDS, WEIGHTS, require_fields, to_arrays
+from scapo.store.checkpoint import (
+    RUN_FIELDS,
+    WEIGHTS,
+    alignment_field,
+    check_header,
+    require_fields,
+    to_arrays,
+)
 from scapo.store.files import read, require_suffix
 from scapo.store.samples import SampleDataset, observe, observed
 
@@ -32,6 +41,7 @@ ANSWERS = 10
 """Clouds whose answers are kept."""
 MODES: tuple[Mode, ...] = ("fast", "quick")
 """Whose answers are kept."""
+LABELLED_SPLIT = "train"
 CHECKS = "checks"
 """Folder of the answers, beside that of the checkpoints."""
 FORMAT = "scapo-answers/1"
@@ -67,8 +77,7 @@ segmented from its surroundings. One object of the category, in the units of the
 
 - Trained on procedural shapes: real objects look different (rows `real`, where there are any).
 - Views that several poses explain are answered by one of them; the scores say how often.
-- Without labels in training the frames of the parts are the method's own, up to one rigid offset
-  for each part (`scapo-bench calibrate` learns it from labelled clouds).
+- {frame}
 - Nothing tells whether a cloud shows the category at all. No safety may rest on an answer.
 
 <details><summary>Configuration</summary>
@@ -100,6 +109,7 @@ def release(request: ReleaseRequest) -> list[Path]:
     require_fields(header, RUN_FIELDS, request.checkpoint)
     if not header["finished"]:
         raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
+    header = {**header, **frame_of_before(method, header, request)}
     source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
     slim(method, request.out, {**header, "source": sha256_file(source)})
     card = request.out.with_suffix(".md")
@@ -107,6 +117,22 @@ def release(request: ReleaseRequest) -> list[Path]:
     answers = answers_file(request.out)
     keep_answers(request, header["category"], answers)
     return [request.out, card, answers]
+
+
+def frame_of_before(
+    method: AbstractMethod, header: Header, request: ReleaseRequest
+) -> dict[str, Any]:
+    """The alignment of a run that was trained before runs had one, by its own training data."""
+    if "pose" in method.supervision or header.get("alignment") is not None:
+        return {}
+    try:
+        split = open_split(request.data, header["category"], LABELLED_SPLIT)
+    except StoreError:
+        return {}
+    if split.manifest.digest != header["data_digest"]:
+        return {}
+    found = aligned(method, split, CLOUDS, MODE, "cpu")
+    return {} if found is None else alignment_field(found)
 
 
 def slim(method: AbstractMethod, out: Path, header: Header) -> None:
@@ -180,7 +206,8 @@ def compare_answers(checkpoint: Path) -> dict[str, Differences]:
 
 def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[str, np.ndarray]]]:
     """The answers of each mode, float32."""
-    model = Predictor(load(checkpoint)[0], "cpu")
+    method, header = load(checkpoint)
+    model = Predictor(method, "cpu", check_header(header, str(checkpoint)).alignment)
     for mode in MODES:
         with torch.no_grad():
             said = model.predict(points, mode)
@@ -201,9 +228,28 @@ def card_of(header: Header, request: ReleaseRequest) -> str:
         parameters=header.get("parameters", 0),
         steps=header["steps"],
         commit=header.get("commit", ""),
+        frame=frame_sentence(header),
         labels=", ".join(header["supervision"]) or "none",
         scores=scores_table(header, request.scores),
         config=json.dumps(header["config"], indent=1, sort_keys=True),
+    )
+
+
+def frame_sentence(header: Header) -> str:
+    """In which frame the model answers, and by which labels."""
+    found = check_header(header, "header").alignment
+    if found is not None:
+        numbers = 6 * len(found.order) + len(found.zero)
+        return (
+            "Poses are in the object's frame (z up, the front towards -x) and states 0 at rest by "
+            f"{numbers} numbers,\n  fitted after training with the labels of "
+            f"{found.clouds.samples} clouds of `{found.clouds.split}`; no weight depends on them."
+        )
+    if "pose" in header["supervision"]:
+        return "Poses are in the frames of the training labels."
+    return (
+        "Without labels in training the frames of the parts are the method's own, up to one rigid "
+        "offset\n  for each part (`scapo-bench calibrate` learns it from labelled clouds)."
     )
 
 
@@ -212,7 +258,7 @@ def scores_table(header: Header, scores: Path | None) -> str:
     if scores is None:
         return "Not given."
     rows = [
-        (*_where(report), variant or "fast", trait, summary)
+        (*_where(report), variant or "fast", trait, _numbers(report, summary))
         for report in _reports(header, scores)
         for variant, trait, summary in _summaries(report)
     ]
@@ -220,9 +266,9 @@ def scores_table(header: Header, scores: Path | None) -> str:
         return "None of this run."
     heads = ["data", "split", "variant", "objects", *(metric[0] for metric in METRICS)]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for data, split, variant, trait, summary in sorted(rows, key=lambda row: row[:4]):
-        lines.append(f"| {data} | {split} | {variant} | {trait} | {_numbers(summary)} |")
-    return "\n".join([*lines, "", LEGEND])
+    lines += [f"| {' | '.join(row)} |" for row in sorted(rows)]
+    told = [UNCALIBRATED_NOTE] if any(UNCALIBRATED in line for line in lines) else []
+    return "\n".join([*lines, "", LEGEND, *told])
 
 
 def _where(report: Report) -> tuple[str, str]:
@@ -249,9 +295,10 @@ def _summaries(report: Report) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
         yield report.variant, trait or "as in training", found["summary"]
 
 
-def _numbers(summary: Mapping[str, Any]) -> str:
+def _numbers(report: Report, summary: Mapping[str, Any]) -> str:
     cells = []
     for _, key, factor, decimals in METRICS:
         mean = summary.get(key, {}).get("mean")
-        cells.append("–" if mean is None else f"{factor * mean:.{decimals}f}")
+        mark = UNCALIBRATED * report.lacks_calibration(key.rpartition("_")[0])
+        cells.append("–" if mean is None else f"{factor * mean:.{decimals}f}{mark}")
     return " | ".join(cells)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.run_files import METRICS, Timing, read_metrics, read_timing
-from scapo.store.checkpoint import RUN_FIELDS, read_checkpoint, require_fields
+from scapo.store.checkpoint import RUN_FIELDS, check_header, read_checkpoint, require_fields
 from scapo.store.files import Header, write_bytes
 from scapo.training.log import PICTURES
 
@@ -88,8 +88,23 @@ def facts(header: Header) -> str:
         "Software": ", ".join(f"{name} {text}" for name, text in header["versions"].items()),
         "Arithmetic": arithmetic(training),
         "Processes": training.get("ranks", ""),
+        "Part frames": frame_words(header),
     }
     return table([], [[name, value] for name, value in pairs.items() if value != ""])
+
+
+def frame_words(header: Header) -> str:
+    """In which frame the run answers, and by which labels."""
+    if "pose" in header["supervision"]:
+        return "the object's, as labelled"
+    found = check_header(header, "header").alignment
+    if found is None:
+        return "the method's own"
+    numbers = 6 * len(found.order) + len(found.zero)
+    return (
+        f"the object's: {numbers} numbers fitted after training with the labels of "
+        f"{found.clouds.samples} clouds of {found.clouds.split}; no weight depends on them"
+    )
 
 
 def arithmetic(training: Mapping[str, Any]) -> str:
@@ -161,10 +176,15 @@ def image(path: Path, caption: str) -> str:
 
 def commands(header: Header) -> str:
     """How the run is used, as typed in the folder that holds it."""
-    calibration = "" if "pose" in header["supervision"] else " --calibration train.safetensors"
+    known = "pose" in header["supervision"] or header.get("alignment") is not None
+    calibration = "" if known else " --calibration train.safetensors"
+    first = (
+        ""
+        if known
+        else ("scapo-bench predict RUN --data DATA --split train --out train.safetensors\n")
+    )
     return (
-        "scapo-bench predict RUN --data DATA --split train --out train.safetensors\n"
-        "scapo-bench predict RUN --data DATA --split test --out test.safetensors\n"
+        f"{first}scapo-bench predict RUN --data DATA --split test --out test.safetensors\n"
         f"scapo-bench evaluate --predictions test.safetensors{calibration} --data DATA "
         f"--out {header['category']}.csv.gz\n\n"
         "from scapo import load\n"

@@ -14,9 +14,8 @@ from jaxtyping import Float, Int
 from bench.analysis.stability import SHIFT, Plan, Timed, equivariance, resampled, summary
 from bench.methods import load
 from bench.requests import StabilityRequest
-from bench.runs.predict import to_arrays
 from bench.runs.train import pick_device
-from bench.scoring.scores import Rows
+from bench.scoring.scores import Rows, to_arrays
 from bench.scoring.truth import revolute
 from scapo.method import AbstractMethod, Mode, evenly
 from scapo.store import Split, open_split, write_bytes

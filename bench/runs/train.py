@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`train`: fit a method to the training split of a data set."""
+"""`train`: fit a method to the training split of a data set, and find the object's frame."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import torch
 from bench.methods import all_methods
 from bench.requests import TrainRequest
 from bench.run_files import TIMING
+from bench.runs.align import align
 from bench.runs.report import REPORT, write_report
 from scapo.categories import category
 from scapo.store import Split, open_split
@@ -49,6 +50,8 @@ def train(
         with joined(device) as ranks:
             try:
                 _fit(request, device, say if ranks.first else None, listener)
+                if ranks.first:
+                    align(request.out, _training_split(request), device, say)
             finally:  # a run that stops early has its page too
                 if ranks.first and (request.out / TIMING).is_file():
                     write_report(request.out)

@@ -83,6 +83,18 @@ def check_calibration(path: Path, header: Header, tested: Header) -> None:
                 f"{path}: header field {name!r}: expected {want!r} as in the "
                 f"predictions to be scored, found {have!r}"
             )
+    if header.object_frame != tested.object_frame:
+        raise StoreError(
+            f"{path}: header field 'object_frame': expected "
+            f"{_frame(tested)} as in the predictions to be scored, found {_frame(header)}"
+        )
+
+
+def _frame(header: Header) -> str:
+    frame = header.object_frame
+    if frame is None:
+        return "none (the method's own frames)"
+    return f"that of {frame.samples} clouds of {frame.split!r} {frame.data_digest[:12]}"
 
 
 def fit(path: Path, split: Split, *, settings: Settings, frames: Frames, seed: int = 0) -> Fitted:
@@ -91,26 +103,15 @@ def fit(path: Path, split: Split, *, settings: Settings, frames: Frames, seed: i
     Raises:
         StoreError: The file is not valid or not of this split.
     """
-    gathered = _Gathered()
+    gathered = Gathered(frames, settings)
     with Predictions(path, split) as predictions:
         order = None
         if settings.label_order == "dataset":
             order = dataset_order(predictions, split)
         for truth in blocks(split):
-            rows = predictions.rows(truth.first, len(truth))
-            gathered.add(truth, rows, settings, frames, order)
+            gathered.add(truth, predictions.rows(truth.first, len(truth)), order)
         predictions.finish()
-    poses = None
-    if gathered.pred:
-        poses = calibrate(
-            np.concatenate(gathered.pred),
-            np.concatenate(gathered.true),
-            scale=np.concatenate(gathered.scale),
-            seed=seed,
-        )
-    offset, count = None, ()
-    if gathered.residual:
-        offset, count = _state_offsets(np.concatenate(gathered.residual), frames.revolute)
+    poses, offset, count = gathered.fitted(seed)
     return Fitted(
         poses=poses,
         state_offset=offset,
@@ -120,24 +121,23 @@ def fit(path: Path, split: Split, *, settings: Settings, frames: Frames, seed: i
     )
 
 
-class _Gathered:
-    """Poses and state residuals of the training split: a few numbers per sample."""
+class Gathered:
+    """Poses and state residuals of labelled clouds, a few numbers per sample, and what they say."""
 
-    def __init__(self) -> None:
+    def __init__(self, frames: Frames, settings: Settings) -> None:
+        """Nothing yet; truth is ordered and symmetry-corrected as these say."""
+        self.frames, self.settings = frames, settings
         self.pred: list[np.ndarray] = []
         self.true: list[np.ndarray] = []
         self.scale: list[np.ndarray] = []
         self.residual: list[np.ndarray] = []
+        self.sign: list[np.ndarray] = []
+        """Of the axes of joints with states, `metrics.state_sign`."""
 
-    def add(
-        self,
-        truth: Truth,
-        rows: Rows,
-        settings: Settings,
-        frames: Frames,
-        order: Int[np.ndarray, " P"] | None,
-    ) -> None:
-        agreement = agreement_of(truth, rows, settings, order)
+    def add(self, truth: Truth, rows: Rows, order: Int[np.ndarray, " P"] | None) -> None:
+        """Answers to some clouds; `order` is the one of the whole data set where it is fixed."""
+        frames = self.frames
+        agreement = agreement_of(truth, rows, self.settings, order)
         if "camera_T_part" in rows:
             self.pred.append(rows["camera_T_part"].astype(np.float64))
             self.true.append(reorder_poses(truth.camera_T_part, agreement.order, frames.symmetry))
@@ -146,8 +146,20 @@ class _Gathered:
             axis = reorder_joints(truth.joint_axis, agreement.order)
             state = reorder_joints(truth.joint_state, agreement.order)
             unit = np.where(frames.revolute, 1.0, truth.scale[:, None])
-            sign = signs(rows, agreement.order, axis)
-            self.residual.append((state - sign * rows["joint_state"]) / unit)
+            self.sign.append(signs(rows, agreement.order, axis))
+            self.residual.append((state - self.sign[-1] * rows["joint_state"]) / unit)
+
+    def fitted(
+        self, seed: int = 0
+    ) -> tuple[Calibration | None, Float[np.ndarray, " J"] | None, tuple[int, ...]]:
+        """Offsets of part frames and of states, None without answers; clouds behind the latter."""
+        poses, offset, count = None, None, ()
+        if self.pred:
+            pred, true, scale = map(np.concatenate, (self.pred, self.true, self.scale))
+            poses = calibrate(pred, true, scale=scale, seed=seed)
+        if self.residual:
+            offset, count = _state_offsets(np.concatenate(self.residual), self.frames.revolute)
+        return poses, offset, count
 
 
 def _state_offsets(

@@ -49,6 +49,7 @@ def record_of(truth: Truth, rows: Rows, frames: Frames) -> dict[str, Any]:
     pivot = (truth.joint_pivot - center[:, None]) * expand[:, None, None]
     slots = label_of(rows)
     weight = slots if slots.ndim == 3 else as_weights(slots, parts)
+    weight = weight[..., list(frames.order)] if frames.order else weight  # as the record has them
     return {
         **{name: rows[f"record_{name}"] for name in RECORD},
         "gt_pose": pose,

@@ -186,11 +186,18 @@ def open_data(request: Request) -> tuple[Header, Split]:
 def fit_frames(
     request: Request, header: Header, split: Split, predictions: Predictions
 ) -> Prepared:
-    """Calibrate on the training split, where that was asked for."""
+    """Calibrate on the training split, where that was asked for.
+
+    Answers that training already brought to the object's frame are taken as they are without it.
+    """
     compat = request.settings.geometry == "opalign-compat"
     if compat:
         check_record(request.predictions, predictions.names)
-    frames = Frames(symmetry=symmetry(split.manifest), revolute=revolute(split.manifest))
+    frames = Frames(
+        symmetry=symmetry(split.manifest),
+        revolute=revolute(split.manifest),
+        order=() if header.object_frame is None else header.object_frame.order,
+    )
     if request.calibration is None:
         if compat:
             raise StoreError(
@@ -200,7 +207,7 @@ def fit_frames(
         order = None
         if request.settings.label_order == "dataset":
             order = dataset_order(predictions, split)
-        return Prepared(frames=frames, order=order)
+        return Prepared(frames=frames, order=order, record=at_training(header))
     path = request.calibration
     trained = read_prediction_header(path)
     check_calibration(path, trained, header)
@@ -214,6 +221,15 @@ def fit_frames(
     return Prepared(
         frames=_with_offsets(frames, fitted), order=fitted.order, canon=canon, record=record
     )
+
+
+def at_training(header: Header) -> dict[str, Any] | None:
+    """What a report says of answers that came in the object's frame without pose labels."""
+    frame = header.object_frame
+    if frame is None:
+        return None
+    return {"at": "training", "samples": frame.samples, "split": frame.split,
+            "data": frame.data_digest, "mode": frame.mode}  # fmt: skip
 
 
 def find_training(folder: Path, trained: Header, scored: Split) -> Split:
@@ -249,9 +265,4 @@ def _readable(folder: Path) -> Split | None:
 
 def _with_offsets(frames: Frames, fitted: Fitted) -> Frames:
     offsets = None if fitted.poses is None else fitted.poses.offsets
-    return Frames(
-        symmetry=frames.symmetry,
-        revolute=frames.revolute,
-        offsets=offsets,
-        state_offset=fitted.state_offset,
-    )
+    return replace(frames, offsets=offsets, state_offset=fitted.state_offset)

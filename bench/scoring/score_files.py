@@ -42,6 +42,8 @@ MAX_TEXT = 64 << 20
 """Bytes of a file of scores, unpacked; 1,000 pairs of glasses take 1.8 million."""
 LONGEST_NAME = 300
 """Characters of a name; a variant is that of the predictions and the readings of the metrics."""
+CALIBRATED = ("part_rotation", "part_translation", "joint_state")
+"""Metrics that need the frames or the states to be the category's."""
 _RANK = {metric.name: rank for rank, metric in enumerate(METRICS)}
 _UNITS = {(metric.name, unit) for metric in METRICS for unit in metric.units}
 
@@ -154,6 +156,16 @@ class Report:
     """Of each object, what sets it apart from the training shapes; empty where none has any."""
     by_trait: dict[str, Any] = field(default_factory=dict)
     """Trait -> its samples, instances, `summary` and `average_precision`."""
+
+    def lacks_calibration(self, metric: str) -> bool:
+        """Whether a metric was taken in frames that the method found for itself.
+
+        Poses of a method that saw none, and states of one that saw no joints either, mean something
+        only after a calibration: at training, or by `evaluate --calibration`.
+        """
+        learned = {"pose", "joint"} if metric == "joint_state" else {"pose"}
+        known = bool(learned & set(self.supervision)) or self.calibration is not None
+        return metric in CALIBRATED and not known
 
     def cost(self, name: str) -> float | None:
         """A number of the budget, which is as the predictions' writer has it: anything."""

@@ -21,6 +21,7 @@ from bench.metrics import (
 from bench.requests import Settings
 from bench.scoring.truth import Truth
 from scapo.geometry.part_order import hard_labels
+from scapo.types import Prediction
 
 Rows = dict[str, np.ndarray]
 """Tensors of a predictions file for some samples."""
@@ -40,6 +41,28 @@ class Frames:
     """own_T_part, translations in r4; None: compared as given."""
     state_offset: Float[np.ndarray, " J"] | None = None
     """Radians, or r4 for a prismatic joint; None: 0."""
+    order: tuple[int, ...] = ()
+    """The part that each of the method's slots became in the predictions; empty: as they were."""
+
+
+def to_arrays(prediction: Prediction) -> Rows:
+    """The tensors of a predictions file; what the method does not say is left out."""
+    joints = prediction.joints
+    tensors = {
+        "part_weight": prediction.part_weight,
+        "camera_T_part": prediction.camera_T_part,
+        "joint_pivot": None if joints is None else joints.pivot,
+        "joint_axis": None if joints is None else joints.axis,
+        "joint_state": None if joints is None else joints.state,
+        "canonical_points": prediction.canonical_points,
+        "confidence_sample": prediction.confidence,
+        **{f"record_{name}": tensor for name, tensor in (prediction.record or {}).items()},
+    }
+    return {
+        name: tensor.detach().cpu().numpy().astype(np.float32)
+        for name, tensor in tensors.items()
+        if tensor is not None
+    }
 
 
 def label_of(rows: Rows) -> np.ndarray:

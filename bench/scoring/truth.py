@@ -98,7 +98,7 @@ def blocks(split: Split, size: int = BLOCK) -> Iterator[Truth]:
                 for start in range(0, shard.count, size):
                     stop = min(start + size, shard.count)
                     rows = {name: item[start:stop] for name, item in slices.items()}
-                    yield _truth(path, shard.first + start, rows)
+                    yield truth_of(path, shard.first + start, rows)
         except SafetensorError as error:
             raise StoreError(f"{path}: expected readable tensors, found {error}") from error
 
@@ -124,7 +124,12 @@ def _check_shard(path: Path, split: Split, count: int) -> None:
                 )
 
 
-def _truth(path: Path, first: int, rows: dict[str, np.ndarray]) -> Truth:
+def truth_of(path: Path, first: int, rows: dict[str, np.ndarray]) -> Truth:
+    """Samples as they are on disk, from `first` on, as float64 with their scale.
+
+    Raises:
+        StoreError: Points that are not finite, or all the same.
+    """
     points = rows["points"]
     centred = points - points.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
     radius = np.sqrt(np.einsum("bnc,bnc->bn", centred, centred)).mean(1, dtype=np.float64)

@@ -15,7 +15,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from bench.scoring.score_files import SUFFIX, side_file
-from bench.tables.model import DASH, Cell, Row, Table
+from bench.tables.model import DASH, UNCALIBRATED, UNCALIBRATED_NOTE, Cell, Row, Table
 from bench.tables.render import MARKS
 from bench.tables.results import Results, series_of
 from bench.tables.rows import display_name, in_order
@@ -161,10 +161,11 @@ def _section(table: Table, columns: Sequence[str], lines: Sequence[Line], files:
             body.append(_row(line, name))
         details.append(_details(table, line, name, files))
     notes = "".join(f"<li>{escape(note)}</li>" for note in table.notes)
+    told = f"<p>{escape(UNCALIBRATED_NOTE)}</p>" if UNCALIBRATED_NOTE in table.notes else ""
     return (
         f'<h2 id="table{table.number}">Table {table.number}</h2><div class="wide"><table>'
         f"<caption>{escape(table.title)}.</caption><thead><tr>{head}</tr></thead>"
-        f"<tbody>{''.join(body)}</tbody></table></div><h3>By category</h3>{''.join(details)}"
+        f"<tbody>{''.join(body)}</tbody></table></div>{told}<h3>By category</h3>{''.join(details)}"
         f"<details><summary>Notes</summary><ul>{notes}</ul></details>"
     )
 
@@ -198,6 +199,7 @@ def _mark(mark: bool | None) -> str:
 
 def _cell(cell: Cell) -> str:
     text = f"<b>{escape(cell.shown)}</b>" if cell.best else escape(cell.shown)
+    text += UNCALIBRATED * cell.uncalibrated
     if cell.low is None or cell.high is None:
         return text
     places = cell.decimals

@@ -37,6 +37,8 @@ class Cell:
     flag: bool = False
     """A printed mean that its own row does not give."""
     best: bool = False
+    uncalibrated: bool = False
+    """It needs a calibration and some of its runs got none."""
 
     @property
     def shown(self) -> str:
@@ -103,6 +105,21 @@ class Table:
     columns: tuple[str, ...]
     blocks: tuple[Block, ...]
     notes: tuple[str, ...]
+
+
+UNCALIBRATED = "‡"
+UNCALIBRATED_NOTE = (
+    "‡ Not calibrated: the method saw no poses, and its answers were compared in frames of its own "
+    "(scapo-bench evaluate --calibration, or training data with labels)."
+)
+
+
+def noted(table: Table) -> Table:
+    """The table with a line on the scores that lack a calibration, where there are any."""
+    cells = (cell for block in table.blocks for row in block.rows for cell in row.cells)
+    if not any(cell.uncalibrated for cell in cells):
+        return table
+    return replace(table, notes=(UNCALIBRATED_NOTE, *table.notes))
 
 
 def mark_best(block: Block) -> Block:

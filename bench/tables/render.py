@@ -11,7 +11,7 @@ import csv
 import io
 import re
 
-from bench.tables.model import DASH, Cell, Row, Table
+from bench.tables.model import DASH, UNCALIBRATED, Cell, Row, Table
 from scapo.text import as_cell, as_markdown
 
 
@@ -48,8 +48,7 @@ def _checks(row: Row, check: str, unknown: str) -> list[str]:
 
 def _markdown(cell: Cell) -> str:
     text = f"**{cell.shown}**" if cell.best else cell.shown
-    if cell.flag:
-        text += "†"
+    text += "†" * cell.flag + UNCALIBRATED * cell.uncalibrated
     if cell.deviation is not None:
         text += f" ± {cell.deviation:.{cell.decimals}f}"
     if cell.low is not None and cell.high is not None:
@@ -60,7 +59,7 @@ def _markdown(cell: Cell) -> str:
 COLUMNS = (
     "table", "block", "method", "source", "pose", "segmentation", "joint", "camera", "column",
     "value", "low", "high", "deviation", "seeds", "n", "k", "undefined", "best",
-    "printed_mean_mismatch",
+    "printed_mean_mismatch", "uncalibrated",
 )  # fmt: skip
 
 
@@ -100,6 +99,7 @@ def _values(cell: Cell, seeds: int) -> tuple[object, ...]:
         cell.undefined or "",
         int(cell.best),
         int(cell.flag),
+        int(cell.uncalibrated),
     )
 
 
@@ -111,6 +111,7 @@ _ESCAPES = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
     "↑": r"$\uparrow$", "↓": r"$\downarrow$", "°": r"$^\circ$", "†": r"$^\dagger$",
+    "‡": r"$^\ddagger$",
     "±": r"$\pm$", "–": "--", "×": r"$\times$", "<": r"$<$", ">": r"$>$", "|": r"$|$",
 }  # fmt: skip
 
@@ -180,6 +181,8 @@ def _latex(cell: Cell) -> str:
         text = rf"\textbf{{{text}}}"
     if cell.flag:
         text += r"$^\dagger$"
+    if cell.uncalibrated:
+        text += r"$^\ddagger$"
     if cell.deviation is not None:
         text += rf"\,$\pm$\,{cell.deviation:.{cell.decimals}f}"
     if cell.low is not None and cell.high is not None:

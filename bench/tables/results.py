@@ -181,7 +181,13 @@ def measured(runs: Sequence[Scores], measure: Measure, seed: int) -> Sampled | N
     tables = [measure.factor * (swapped(t) if key[0] == "order" else t) for t in tables]
     if not tables or all(np.isnan(table).all() for table in tables):
         return None
-    return _sampled(runs, tables, measure.decimals, seed)
+    return _marked(_sampled(runs, tables, measure.decimals, seed), runs, measure.metric)
+
+
+def _marked(sampled: Sampled, runs: Sequence[Scores], metric: str) -> Sampled:
+    """Marked where some run lacks a calibration that this metric needs."""
+    lacks = any(run.report.lacks_calibration(metric) for run in runs)
+    return replace(sampled, cell=replace(sampled.cell, uncalibrated=lacks))
 
 
 def seconds_per_cloud(runs: Sequence[Scores]) -> Cell:
@@ -201,7 +207,8 @@ def precise(runs: Sequence[Scores], key: str, rule: ApRule, seed: int) -> Sample
         return None
     sampled = _sampled(runs, tables, 2, seed)
     passed, count = sum(int((t > 0).sum()) for t in tables), sum(t.size for t in tables)
-    return Sampled(_with_precision(sampled.cell, passed, count), sampled.means, sampled.per_seed)
+    sampled = replace(sampled, cell=_with_precision(sampled.cell, passed, count))
+    return _marked(sampled, runs, "part_rotation" if key.startswith("part") else key)
 
 
 def _with_precision(cell: Cell, passed: int, count: int) -> Cell:
@@ -268,6 +275,7 @@ def averaged(parts: Sequence[Sampled | None]) -> Cell:
         value=float(np.mean(values)), decimals=known[0].cell.decimals, low=low, high=high,
         deviation=_deviation([float(value) for value in per_seed]),
         undefined=sum(part.cell.undefined for part in known),
+        uncalibrated=any(part.cell.uncalibrated for part in known),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from bench.metrics import ApRule
 from bench.tables.actuation import load_actuations, table_7
 from bench.tables.leaderboard import PAGE, to_html
 from bench.tables.means import table_1, table_4, table_5, table_6
-from bench.tables.model import Block, Cell, Row, Table, mark_best
+from bench.tables.model import Block, Cell, Row, Table, mark_best, noted
 from bench.tables.paper import MEAN, Cells, mean_mismatches, printed_cells
 from bench.tables.precision import table_2
 from bench.tables.render import to_csv, to_latex, to_markdown
@@ -99,7 +99,7 @@ def make_tables(
         )
     tables = (*build(results, rule), table_7(actuations))
     tables = tuple(map(ours_of, tables)) if only_ours else tables
-    return Made(scores=scores, results=results, tables=tables, rule=rule)
+    return Made(scores=scores, results=results, tables=tuple(map(noted, tables)), rule=rule)
 
 
 def ours_of(table: Table) -> Table:

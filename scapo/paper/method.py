@@ -364,5 +364,6 @@ class Scapo(AbstractMethod):
                 state=torch.where(slide, state / scale, state),
             ),
             canonical_points=explanation.template / scale[..., None],
+            canonical_part=explanation.template_weights.argmax(-1),
             record=opalign_record(explanation),
         )

@@ -8,6 +8,7 @@ file so that a killed run can never pair the weights of one step with the state 
 
 from __future__ import annotations
 
+import json
 import platform
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, is_dataclass
@@ -18,10 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from scapo.alignment import Alignment
 from scapo.categories import CATEGORIES, Category
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.store.definitions import DEFINITION, defined
-from scapo.store.files import CHECKPOINT, Arrays, Header, read, write
+from scapo.store.files import CHECKPOINT, Arrays, Header, canonical_json, read, write
 from scapo.store.json_records import StoreError, from_json
 from scapo.types import Supervision
 
@@ -138,6 +140,21 @@ def write_checkpoint(path: Path, module: nn.Module, header: Header) -> str:
     return write(path, to_arrays(module), header)
 
 
+def with_alignment(path: Path, alignment: Alignment) -> str:
+    """Store what brings a method's answers to the object's frame; weights stay bit for bit.
+
+    Returns:
+        The file's new SHA-256.
+    """
+    arrays, header = read_checkpoint(path)
+    return write(path, arrays, {**header, **alignment_field(alignment)})
+
+
+def alignment_field(alignment: Alignment) -> Header:
+    """What a header says of an alignment, as JSON has it."""
+    return {"alignment": json.loads(canonical_json(asdict(alignment)))}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CheckpointHeader:
     """What a checkpoint says of itself, as far as anything here reads it."""
@@ -160,6 +177,8 @@ class CheckpointHeader:
     normalisation: dict[str, str | float] = field(default_factory=dict)
     definition: dict[str, Any] | None = None
     """Of a category that the package has not (`definitions`)."""
+    alignment: Alignment | None = None
+    """None: answers are in the method's own frames; so are those of checkpoints of before."""
 
 
 RUN_FIELDS = ("seed", "data_digest", "supervision", "steps", "finished", "versions")
@@ -190,7 +209,12 @@ def check_header(header: object, where: str) -> CheckpointHeader:
         StoreError: As `read_checkpoint`.
     """
     known = from_json(CheckpointHeader, header, where)
-    header_category(known, where)
+    parts = header_category(known, where).parts
+    if known.alignment is not None and len(known.alignment.order) != len(parts):
+        raise StoreError(
+            f"{where}: alignment: expected that of {len(parts)} parts, found "
+            f"{len(known.alignment.order)}"
+        )
     return known
 
 

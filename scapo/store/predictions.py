@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, get_args
@@ -19,10 +19,12 @@ import numpy as np
 from jaxtyping import Bool, Num
 from safetensors import SafetensorError, safe_open
 
+from scapo.alignment import ObjectFrame
 from scapo.categories import Category
 from scapo.geometry.matrices import rotation_error
 from scapo.store.definitions import defined, definition, foreign
 from scapo.store.files import PREDICTIONS, read_header, write
+from scapo.store.json_records import from_json
 from scapo.store.manifest import Manifest
 from scapo.store.samples import UNLABELLED
 from scapo.store.schema import StoreError
@@ -68,6 +70,9 @@ class Header:
     """The training behind it: commit, config, machine, data digest of its split."""
     definition: Category | None = None
     """Of a category that the package has not."""
+    object_frame: ObjectFrame | None = None
+    """None: where `supervision` has no poses, frames, order of parts and states are the method's
+    own."""
 
     def record(self) -> dict[str, Any]:
         """As stored in the file."""
@@ -84,6 +89,7 @@ class Header:
             "run": self.run,
             **({} if self.camera is None else {"camera": self.camera}),
             **({} if self.definition is None else definition(self.definition)),
+            **({} if self.object_frame is None else {"object_frame": asdict(self.object_frame)}),
         }
 
 
@@ -132,7 +138,19 @@ def read_prediction_header(path: Path) -> Header:
         budget=_object(path, record, "budget"),
         run=_object(path, record, "run"),
         definition=None if known is None else foreign(known),
+        object_frame=_object_frame(path, record),
     )
+
+
+def _object_frame(path: Path, record: dict[str, Any]) -> ObjectFrame | None:
+    where = f"{path}: header field 'object_frame'"
+    value = record.get("object_frame")
+    if value is None:
+        return None
+    found = from_json(ObjectFrame, value, where)
+    if sorted(found.order) != list(range(len(found.order))):
+        raise StoreError(f"{where}: order: expected every part once, found {found.order}")
+    return found
 
 
 def _camera(path: Path, record: dict[str, Any]) -> bool | None:
@@ -233,6 +251,12 @@ class Predictions:
         """Samples without an answer so far, by tensor."""
         self._count = split.manifest.count
         self._parts = len(split.manifest.parts)
+        frame = self.header.object_frame
+        if frame is not None and len(frame.order) not in (0, self._parts):
+            raise StoreError(
+                f"{path}: header field 'object_frame': order: expected that of {self._parts} "
+                f"parts, found {frame.order}"
+            )
         self._file = safe_open(path, "numpy")
         self._slices = check_tensors(str(path), self._file.__enter__(), split)
 

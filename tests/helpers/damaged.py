@@ -103,6 +103,7 @@ def scaled(factor):
     return lambda array: array * np.float32(factor)
 
 
+FRAME = {"split": "train", "data_digest": "d" * 64, "samples": 30}
 DAMAGE = {
     "empty file": lambda split, arrays: b"",
     "not safetensors": lambda split, arrays: b"method,variant,seed\n" * 9,
@@ -149,6 +150,10 @@ DAMAGE = {
     "budget a text": with_header(budget="cheap"),
     "camera a text": with_header(camera="yes"),
     "camera a number": with_header(camera=1),
+    "an object frame in text": with_header(object_frame="yes"),
+    "an object frame of no data": with_header(object_frame={"split": "train", "samples": 3}),
+    "an object frame of two parts": with_header(object_frame=FRAME | {"order": [1, 0]}),
+    "an object frame with a part twice": with_header(object_frame=FRAME | {"order": [0, 1, 1]}),
     "no tensors": lambda split, arrays: file_bytes({}, header_json(split)),
     "no segmentation": dropped("part"),
     "both segmentations": added(

@@ -15,6 +15,7 @@ from bench.infer.calibration import Calibration
 from bench.infer.model import Model
 from scapo.categories import CATEGORIES, Category
 from scapo.geometry.points import Similarity
+from scapo.geometry.rigid import joint_motion, rigid
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import AbstractMethod, Mode, Stage, Step
 from scapo.predictor import Predictor
@@ -24,8 +25,11 @@ from scapo.registered.decode import nearest_weights, placed_prediction
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.template import turn_placement
 from scapo.registered.view_bank import ShownPoints
+from scapo.store import Split
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
+from scapo.store.samples import UNLABELLED
 from scapo.types import Labels, Observation, Prediction
+from tests.helpers.made import sample_arrays, write_split
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
@@ -113,3 +117,26 @@ def placed_run(folder: Path, category: str = "oven") -> Path:
     header = checkpoint_header("registered", CONFIG, category, {"seed": 1, "steps": 0})
     write_checkpoint(folder / WEIGHTS, placed(category), header)
     return folder
+
+
+def told_split(told: Told, folder: Path, split: str, *, labelled: bool = True) -> Split:
+    """The clouds that `told` knows with their truth, as a split of ovens."""
+    count = len(told.clouds())
+    arrays = sample_arrays("oven", count, told.clouds().shape[1], instances=6)
+    shift = told.truth.translation - told.views.camera
+    base = rigid(told.truth.rotation, shift)
+    pivot = (told.truth.rotation @ told.template.pivot[0, :, None])[..., 0] + shift
+    axis = (told.truth.rotation @ told.template.directions()[0, :, None])[..., 0]
+    state = told.truth.state[:, 0]
+    lid = joint_motion(pivot, axis, state, "revolute") @ base
+    found = Told.predict(told, Observation(points=torch.as_tensor(told.clouds())))
+    truth = {
+        "points": told.clouds(), "camera_T_part": np.stack([base.numpy(), lid.detach().numpy()], 1),
+        "joint_pivot": pivot[:, None].detach().numpy(), "joint_state": state[:, None].numpy(),
+        "joint_axis": axis[:, None].detach().numpy(),
+        "part": found.part_weight.argmax(-1).numpy().astype(np.uint8),
+    }  # fmt: skip
+    arrays |= {k: v.astype(arrays[k].dtype) for k, v in truth.items()}
+    if not labelled:
+        arrays["part"][:] = UNLABELLED
+    return write_split(folder, "oven", split, arrays)

@@ -16,7 +16,7 @@ SAMPLES, OBJECTS = 40, 8
 def make_scores(
     folder, method, category, *, seed=1, kind="clean", quality=1.0, supervision=(), variant="",
     samples=SAMPLES, digest="0123456789ab", split="test", budget=None, camera=None, traits=(),
-    order=None,
+    order=None, calibration=None,
 ):  # fmt: skip
     """A scores file with random errors; larger `quality` is worse."""
     generator = np.random.default_rng([seed, len(category), len(method)])
@@ -41,7 +41,12 @@ def make_scores(
     with writing(path) as file:
         file.add(run, 0, {key: value[:15] for key, value in errors.items()})
         file.add(run, 15, {key: value[15:] for key, value in errors.items()})
-        own = {"camera": camera, "trait": list(traits) or None, "budget": budget}
+        own = {
+            "camera": camera,
+            "trait": list(traits) or None,
+            "budget": budget,
+            "calibration": calibration,
+        }
         known = {name: value for name, value in own.items() if value is not None}
         file.report = report_of(run, supervision, samples) | known
     return errors

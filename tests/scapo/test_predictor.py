@@ -11,14 +11,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from scapo.alignment import unit_length
 from scapo.categories import CATEGORIES
 from scapo.predictor import Predictor, load, released
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
 from scapo.registry import LIBRARY
-from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
+from scapo.store.checkpoint import WEIGHTS, checkpoint_header, with_alignment, write_checkpoint
 from scapo.store.schema import StoreError
 from scapo.types import Observation
+from tests.helpers.conventions import convention
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import TINY, tiny
@@ -44,6 +46,25 @@ def test_answers_are_those_of_the_model(saved: Path) -> None:
     assert_close(one.joints.pivot, wanted.joints.pivot[0])
     nested = load(saved).predict(points.numpy().reshape(3, 1, 96, 3))
     assert nested.part_weight.shape == (3, 1, 96, 2)
+
+
+def test_a_stored_alignment_is_applied_unless_own_frames_are_asked_for(saved: Path) -> None:
+    points = plates(3, 96)[0].points
+    own = load(saved).predict(points)
+    assert not load(saved).in_object_frame
+    alignment = convention((1, 0), np.random.default_rng(0))
+    with_alignment(saved / WEIGHTS, alignment)
+    model = load(saved)
+    assert model.in_object_frame
+    assert_close(model.predict(points, own_frame=True).camera_T_part, own.camera_T_part)
+    category = CATEGORIES["laptop"]
+    found = model.predict(points)
+    wanted = alignment.apply(own, unit_length(points), category)
+    for field in ("part_weight", "camera_T_part", "canonical_points"):
+        assert_close(getattr(found, field), getattr(wanted, field))
+    nested = model.predict(points.reshape(3, 1, 96, 3)).camera_T_part
+    assert nested is not None
+    assert_close(nested[:, 0], found.camera_T_part)
 
 
 @pytest.mark.parametrize("shape", [(3,), (96, 2), (4, 3)])

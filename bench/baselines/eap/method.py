@@ -228,7 +228,7 @@ class Eap(AbstractMethod):
         points, similarity = normalise(observation.points)
         whole, passes = self.explain(points, self._usual())
         last = passes[-1]
-        order = last.one.chosen.order()
+        order, shapes = last.one.chosen.order(), last.one.chosen.shapes
         place = rigid(whole.rotation, torch.zeros_like(whole.rotation[:, 0]))[:, None]
         poses = gather((place @ last.poses()).flatten(2), order).unflatten(2, (4, 4))
         pivot, axis, state = last.joints()
@@ -242,7 +242,8 @@ class Eap(AbstractMethod):
                 axis=axis @ whole.rotation.mT,
                 state=state / scale if self.kind == "prismatic" else state,
             ),
-            canonical_points=last.one.chosen.shapes.flatten(1, 2) / scale[..., None],
+            canonical_points=shapes.flatten(1, 2) / scale[..., None],
+            canonical_part=order.argsort(1)[..., None].expand(shapes.shape[:3]).flatten(1),
         )
 
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:

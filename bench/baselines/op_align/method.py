@@ -441,6 +441,7 @@ class OpAlign(AbstractMethod):
                 state=torch.where(self._slides(state), state / scale, state),
             ),
             canonical_points=e.shape.points / scale[..., None],
+            canonical_part=e.canonical.weights.argmax(-1),
             record=opalign_record(e),
         )
 

@@ -21,8 +21,8 @@ from bench.baselines.supervised import (
     SupervisedMethod,
 )
 from bench.metrics import sample_errors
-from bench.runs.predict import to_arrays
 from bench.scoring.score_files import read_scores
+from bench.scoring.scores import to_arrays
 from scapo.categories import CATEGORIES
 from scapo.geometry.points import normalise
 from scapo.records import take

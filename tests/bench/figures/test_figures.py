@@ -27,6 +27,7 @@ from bench.figures.overlay import canonical, overlay_picture
 from bench.figures.pictures import SHARES, badness, ranked, ranking_picture
 from bench.figures.template import (
     TemplateShape,
+    aligned_shape,
     at_states,
     carried,
     state_steps,
@@ -34,13 +35,14 @@ from bench.figures.template import (
     template_shape,
 )
 from bench.requests import Request
-from scapo.categories import category
+from scapo.categories import CATEGORIES, category
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.template import Placement
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.store.predictions import write_predictions
 from tests.helpers import made
+from tests.helpers.conventions import convention
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import TINY, tiny
 
@@ -195,6 +197,21 @@ def test_templates_of_both_methods() -> None:
     np.testing.assert_allclose(moved, moved[:1].repeat(len(moved), 0), atol=1e-6)
     base = shape.points[shape.weight.argmax(1) == 0]
     np.testing.assert_allclose(np.quantile(base, [0.02, 0.98], axis=0).mean(0), 0, atol=1e-5)
+
+
+def test_a_template_in_the_objects_frame_moves_as_the_category_says() -> None:
+    own = convention((1, 0), np.random.default_rng(4))
+    shape, category = hinge(), CATEGORIES["oven"]
+    found = aligned_shape(shape, own, category)
+    part = shape.weight.argmax(1)
+    np.testing.assert_array_equal(found.weight, shape.weight[:, ::-1])
+    for slot in (0, 1):  # a part's points at rest are those of its own frame, undone
+        inverse = np.linalg.inv(np.array(own.own_T_part[own.order[slot]]))
+        expected = transform(inverse, shape.points[part == slot])
+        np.testing.assert_allclose(found.points[part == slot], expected, atol=1e-12)
+    base = np.linalg.inv(np.array(own.own_T_part[0]))
+    np.testing.assert_allclose(found.pivot, transform(base, shape.pivot), atol=1e-12)
+    np.testing.assert_allclose(found.axis, own.sign[0] * shape.axis @ base[:3, :3].T, atol=1e-12)
 
 
 @torch.no_grad()

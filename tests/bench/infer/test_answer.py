@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from bench.infer.answer import agreement, ask, mean_radius
+from bench.infer.answer import agreement, ask
 from bench.infer.cloud import Cloud, InputError
 from bench.matching import rotation_degrees
 from bench.twin.record import BACKGROUND
@@ -87,7 +87,3 @@ def test_answers_that_are_none_are_refused(told, monkeypatch):
     monkeypatch.setattr(Predictor, "predict", lambda *_: lost)
     with pytest.raises(InputError, match="an answer in numbers, found NaN"):
         ask("a", cloud, model, "fast")
-
-
-def test_mean_radius():
-    assert mean_radius(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 3, 0], [0, -3, 0]])) == 2

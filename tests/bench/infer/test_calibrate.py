@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from bench.infer import answer
@@ -13,12 +11,9 @@ from bench.infer import calibrate as room
 from bench.infer.calibrate import calibrate
 from bench.infer.calibration import read_calibration
 from bench.requests import CalibrateRequest
-from scapo.geometry.rigid import joint_motion, rigid
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.schema import StoreError
-from scapo.types import Observation
-from tests.helpers.made import sample_arrays, write_split
-from tests.helpers.placed import Told, placed_run, told_model
+from tests.helpers.placed import Told, placed_run, told_model, told_split
 
 COUNT = 24
 
@@ -32,22 +27,7 @@ def told() -> Told:
 @pytest.fixture
 def data(told, tmp_path):
     """The clouds with the truth, as a split `val`."""
-    arrays = sample_arrays("oven", COUNT, told.clouds().shape[1], instances=6)
-    shift = told.truth.translation - told.views.camera
-    base = rigid(told.truth.rotation, shift)
-    pivot = (told.truth.rotation @ told.template.pivot[0, :, None])[..., 0] + shift
-    axis = (told.truth.rotation @ told.template.directions()[0, :, None])[..., 0]
-    state = told.truth.state[:, 0]
-    lid = joint_motion(pivot, axis, state, "revolute") @ base
-    found = told.predict(Observation(points=torch.as_tensor(told.clouds())))
-    truth = {
-        "points": told.clouds(), "camera_T_part": np.stack([base.numpy(), lid.detach().numpy()], 1),
-        "joint_pivot": pivot[:, None].detach().numpy(), "joint_state": state[:, None].numpy(),
-        "joint_axis": axis[:, None].detach().numpy(),
-        "part": found.part_weight.argmax(-1).numpy().astype(np.uint8),
-    }  # fmt: skip
-    arrays |= {k: v.astype(arrays[k].dtype) for k, v in truth.items()}
-    write_split(tmp_path / "data", "oven", "val", arrays)
+    told_split(told, tmp_path / "data", "val")
     return tmp_path / "data"
 
 
@@ -62,6 +42,7 @@ def test_confidences_follow_how_often_answers_are_right(told, data, tmp_path, mo
     assert [path.name for path in written] == ["checkpoint.calibration-fast.json", "r.png"]
     assert read_calibration(written[0], "0" * 64) == found
     assert found.samples == COUNT
+    assert found.alignment is not None
     assert found.alignment.order == (0, 1)
     assert found.alignment.sign == (1.0,)
     assert found.alignment.zero[0] == pytest.approx(0, abs=1e-3)

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bench.infer.alignment import Alignment
 from bench.infer.calibration import (
     Calibration,
     LogisticMap,
@@ -21,8 +21,10 @@ from bench.infer.calibration import (
     write_calibration,
 )
 from bench.twin.record import Twin
+from scapo.alignment import Alignment
 from scapo.categories import CATEGORIES
 from scapo.store.schema import StoreError
+from tests.helpers.conventions import CLOUDS
 
 OVEN = CATEGORIES["oven"]
 EVIDENCE = {"residual": 0.3, "margin": 0.2, "joint_0_spread": 2.0, "part_0_spread": 1.0,
@@ -33,7 +35,8 @@ def calibration() -> Calibration:
     one = LogisticMap(bias=0.5, weight=(-1.0, 2.0, -0.5))
     return Calibration(
         model="a" * 64, mode="quick", category="oven", split="val", data="d", samples=30,
-        alignment=Alignment.none(OVEN), joint=(one,), part=(one, replace(one, bias=-1.0)),
+        alignment=Alignment.of_order((0, 1), CLOUDS),
+        joint=(one,), part=(one, replace(one, bias=-1.0)),
         reliability={"joint": reliability(np.array([0.25, 0.8]), np.array([False, True]))},
     )  # fmt: skip
 
@@ -104,5 +107,25 @@ def test_it_is_read_as_written_and_belongs_to_one_checkpoint(tmp_path):
     with pytest.raises(StoreError, match="found that of aaaaaaaaaaaa: scapo-bench calibrate"):
         read_calibration(path, "b" * 64)
     path.write_text("{}")
-    with pytest.raises(StoreError, match="expected scapo-calibration/1"):
+    with pytest.raises(StoreError, match="expected scapo-calibration/2"):
+        read_calibration(path, "a" * 64)
+
+
+def test_files_of_before_are_read_their_one_offset_for_every_part(tmp_path):
+    path = calibration_file(tmp_path / "checkpoint.safetensors", "quick")
+    write_calibration(path, calibration())
+    record = json.loads(path.read_text())
+    base = np.eye(4)
+    base[:3, 3] = [0.1, 0.2, 0.3]
+    record["format"] = "scapo-calibration/1"
+    record["alignment"] = {"order": [1, 0], "base": base.tolist(), "sign": [-1.0], "zero": [0.5]}
+    path.write_text(json.dumps(record))
+    found = read_calibration(path, "a" * 64)
+    assert found.alignment is not None
+    assert (found.alignment.order, found.alignment.sign) == ((1, 0), (-1.0,))
+    np.testing.assert_array_equal(found.alignment.own_T_part, [base, base])
+    assert found.alignment.clouds.samples == 30
+    record["alignment"] = {"order": 3}
+    path.write_text(json.dumps(record))
+    with pytest.raises(StoreError, match="alignment"):
         read_calibration(path, "a" * 64)

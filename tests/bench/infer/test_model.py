@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from bench.infer import model as models
-from bench.infer.alignment import Alignment
 from bench.infer.model import load_model, load_models
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.files import sha256_file
@@ -25,8 +24,7 @@ def test_a_run_names_itself(tmp_path):
         assert found.category.name == "oven"
         assert found.digest == sha256_file(run / WEIGHTS)
         assert found.calibration is None
-        assert found.alignment() == Alignment.none(found.category)
-        assert not found.is_aligned
+        assert not found.predictor.in_object_frame
 
 
 def test_released_models_answer_by_category(tmp_path, monkeypatch):
@@ -56,7 +54,7 @@ def test_without_released_models_a_run_is_asked_for(monkeypatch):
 def test_a_calibration_of_another_checkpoint_is_refused(tmp_path):
     run = placed_run(tmp_path)
     (run / "checkpoint.calibration-fast.json").write_text("{}")
-    with pytest.raises(StoreError, match=r"calibration-fast\.json: expected scapo-calibration/1"):
+    with pytest.raises(StoreError, match=r"calibration-fast\.json: expected scapo-calibration/2"):
         load_model(run, "cpu", "fast")
     assert load_model(run, "cpu", "quick").calibration is None
     assert load_model(run, "cpu", None).calibration is None

@@ -18,10 +18,12 @@ from bench.runs import release as releasing
 from bench.runs.release import MAX_BYTES, answers_file, card_of, compare_answers, release
 from bench.scoring.evaluate import evaluate
 from scapo import predictor
+from scapo.alignment import Alignment
 from scapo.predictor import find, load
 from scapo.store import StoreError
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, read_checkpoint, write_checkpoint
 from scapo.types import Observation
+from tests.helpers.conventions import CLOUDS
 from tests.helpers.made import sample_arrays, write_split, write_truth
 from tests.helpers.placed import placed
 from tests.helpers.sighted import sighted
@@ -71,6 +73,26 @@ def test_a_release_is_half_as_large_and_answers_alike(folder: Path, monkeypatch)
     assert answers.parent == folder / "results" / "checks"
 
 
+def test_a_run_of_before_gets_its_frame_from_its_own_training_data(folder: Path, monkeypatch):
+    split = write_split(folder / "data", "laptop", "train", sample_arrays("laptop", 24, 96))
+    made = Alignment.of_order((1, 0), CLOUDS)
+    monkeypatch.setattr(releasing, "aligned", lambda *_: made)
+    weights, card, _ = release(request(folder))
+    assert read_checkpoint(weights)[1].get("alignment") is None  # the run's data are others
+    assert "the frames of the parts are the method's own" in card.read_text()
+    arrays, header = read_checkpoint(folder / "run")
+    about = {**header, "data_digest": split.manifest.digest}
+    releasing.write(folder / "run" / WEIGHTS, arrays, about)
+    weights, card, _ = release(request(folder))
+    assert load(weights).alignment == made
+    assert "13 numbers,\n  fitted after training with the labels of 30 clouds" in card.read_text()
+    points = np.random.default_rng(0).normal(size=(96, 3))
+    here, own = (load(weights).predict(points, own_frame=flag) for flag in (False, True))
+    assert_close(here.part_weight, own.part_weight.flip(-1))
+    for found in compare_answers(weights).values():
+        assert float(found.pose.max()) == 0
+
+
 def test_other_answers_are_noticed(folder: Path):
     weights, _, answers = release(request(folder))
     for found in compare_answers(weights).values():
@@ -103,7 +125,8 @@ def test_the_card_tells_the_scores_of_this_run(folder: Path):
         evaluate(Request(predictions=path, data=folder / "data", out=out))
         text = card_of(header, request(folder, scores=folder / "scores"))
         assert ("None of this run." in text) == (name == "other")
-    assert "| clean | test | fast | all | 100.0 | 0.0 | 0.000 | 0.0 | 0.000 |" in text
+    assert "| clean | test | fast | all | 100.0 | 0.0 | 0.000 | 0.0‡ | 0.000‡ |" in text
+    assert text.count("‡ Not calibrated: ") == 1
     assert text.count("| all |") == 1
     assert "d" * 64 in text
     assert "## Limits" in text

@@ -17,8 +17,8 @@ from bench.cli.verbs import prepare
 from bench.methods import METHODS, load
 from bench.requests import PredictRequest
 from bench.runs import predict as predicting
-from bench.runs.predict import to_arrays
 from bench.runs.train import pick_device
+from bench.scoring.scores import to_arrays
 from scapo.method import OracleMethod
 from scapo.paper.method import Scapo
 from scapo.store import open_split

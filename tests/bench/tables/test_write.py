@@ -134,6 +134,28 @@ def test_best_is_bold_among_the_self_supervised(built):
     assert [row["method"] for row in printed] == ["OP-Align"]  # 4.41 against SCAPO's 4.70
 
 
+def test_scores_that_lack_a_calibration_are_marked_in_every_table(tmp_path):
+    for name in TABLE_1_CATEGORIES:
+        make_scores(tmp_path / "bare", "scapo", name)
+        make_scores(tmp_path / "bare", "eap", name, calibration={"at": "training", "samples": 9})
+        make_scores(tmp_path / "bare", "gcn3d", name, supervision=["pose", "segmentation"])
+        make_scores(tmp_path / "bare", "op-align", name, supervision=["joint", "segmentation"])
+    make_scores(tmp_path / "bare", "scapo", "drawer", kind="sensor")
+    made = tables.make_tables(tmp_path / "bare")
+    marked = {(row["block"].split()[0], row["method"]) for table in made.tables[:1]
+              for row in rows_of(table, uncalibrated="1")}  # fmt: skip
+    assert marked == {(symbol, "SCAPO") for symbol in ("R", "t", "q")} | {
+        (symbol, "OP-Align") for symbol in ("R", "t")
+    }
+    rates = {row["column"] for row in rows_of(made.tables[1], uncalibrated="1", block="Drawer")}
+    assert rates == {"Part 5°5cm", "Part 10°10cm", "Part 15°15cm", "State"}
+    paths = {path.name: path.read_text() for path in made.write(tmp_path / "out", page=True)}
+    for name, mark in (("table1.md", "‡"), ("table1.tex", r"$^\ddagger$"), ("index.html", "‡")):
+        assert paths[name].count(f"{mark} Not calibrated: ") == (4 if name == "index.html" else 1)
+        assert paths[name].count(mark) > 10
+    assert "‡" not in paths["table3.md"]
+
+
 def test_the_papers_tables_from_the_same_code():
     """Without scores: every printed cell, in the paper's places."""
     one_, two, three, *_ = tables.build(Results([]))

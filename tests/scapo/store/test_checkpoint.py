@@ -7,13 +7,16 @@ import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from scapo.alignment import Alignment
 from scapo.paper.config import ScapoConfig
 from scapo.store import checkpoint
 from scapo.store.schema import StoreError
+from tests.helpers.conventions import CLOUDS, convention
 from tests.helpers.tiny import TINY, tiny
 
 
@@ -94,3 +97,40 @@ def test_missing_fields_take_defaults_and_unknown_ones_are_refused() -> None:
 def test_a_configuration_must_be_a_dataclass() -> None:
     with pytest.raises(TypeError, match="expected a dataclass, found dict"):
         checkpoint.checkpoint_header("m", {}, "laptop", {})
+
+
+def test_an_alignment_is_stored_without_a_change_to_the_weights(tmp_path: Path) -> None:
+    path = tmp_path / checkpoint.WEIGHTS
+    header = checkpoint.checkpoint_header("scapo", TINY, "laptop", {"seed": 3})
+    checkpoint.write_checkpoint(path, tiny(0), header)
+    before, plain = checkpoint.read_checkpoint(path)
+    assert checkpoint.check_header(plain, "x").alignment is None
+    alignment = convention((1, 0), np.random.default_rng(0))
+    checkpoint.with_alignment(path, alignment)
+    after, header = checkpoint.read_checkpoint(path)
+    assert checkpoint.check_header(header, "x").alignment == alignment
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+    assert {**plain, **checkpoint.alignment_field(alignment)} == header
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"order": [0, 1, 2]}, "alignment: expected fields that fit, found own_T_part: expected 3"),
+        ({"order": [0, 0]}, "alignment: expected fields that fit, found order: expected every"),
+        ({"zero": ["a"]}, "zero"),
+        ({"clouds": {}}, "expected field 'split', found none"),
+    ],
+)
+def test_damaged_alignments_are_refused(change: dict[str, object], message: str) -> None:
+    header = {"method": "scapo", "category": "laptop", "config": {}}
+    field = checkpoint.alignment_field(Alignment.of_order((1, 0), CLOUDS))
+    with pytest.raises(StoreError, match=message):
+        checkpoint.check_header({**header, "alignment": {**field["alignment"], **change}}, "x")
+
+
+def test_an_alignment_of_other_parts_is_refused() -> None:
+    header = {"method": "scapo", "category": "laptop", "config": {}}
+    field = checkpoint.alignment_field(Alignment.of_order((0, 2, 1), CLOUDS))
+    with pytest.raises(StoreError, match="x: alignment: expected that of 2 parts, found 3"):
+        checkpoint.check_header({**header, **field}, "x")
