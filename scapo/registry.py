@@ -87,7 +87,10 @@ LIBRARY: dict[str, Method] = {
         title="Template registration",
         rank=80,
         maker="scapo.registered.method:TemplateRegistration",
-        presets={"cpu": "scapo.registered.config:cpu_config"},
+        presets={
+            "cpu": "scapo.registered.config:cpu_config",
+            "quick": "scapo.registered.config:quick_config",
+        },
         camera=True,
     ),
     "registered-labelled": Method(

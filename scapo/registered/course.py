@@ -33,10 +33,10 @@ T = TypeVar("T")
 JUDGES = 4  # At most one view in so many is held out
 PAIR, GRID = 0.010, 1000
 """Seconds of one core, as all below: a pair of views that is registered over so many rotations."""
-FIRST_FIT, OBJECT, FIT, DENSE, DEVIATION = 12.0, 5.0, 5.0, 4.0, 45.0
-"""A first template; an object beside its pairs; bundle adjustment after a search; a dense template;
-templates whose axes deviate."""
-VIEW = 0.1  # A view that is searched
+FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 40.0
+"""A view that a first template is fitted to; an object beside its pairs; the first template of
+several objects; bundle adjustment after a search; a dense template; axes that deviate."""
+VIEW = 0.072  # A view that is searched
 BELIEF = 20.0  # Seconds of steps for which usual times count, beside those that were measured
 RECORDS: tuple[type[Any], ...] = (
     Candidate, Inliers, JointProposal, Motion, OneObject, PartialViews, Placement, PosedViews,
@@ -59,11 +59,11 @@ def plan_of(
     judged = VIEW * min(config.judged, views // JUDGES)
     half = VIEW * min(config.searched // 2, views) + FIT
     plan, tried = _of_objects(config, objects) if objects else _of_draws(config, kinds)
-    plan["judging first templates"] = judged * tried
     left = min(config.finalists, tried)
+    plan["judging first templates"] = judged * tried * (tried > 1)
     for rung in numbered("rung", len(config.heats)):
         plan |= {f"{rung}, {one}": half for one in numbered("template", left)}
-    plan["judging templates"] = judged * left
+    plan["judging templates"] = judged * left * (left > 1)
     rounds = numbered("round", len(config.trusted))
     if config.mirror and rounds:
         plan |= {f"{rounds[0]}, {one}": half for one in numbered("mirror image", 4)}
@@ -91,7 +91,7 @@ def _of_objects(config: DiscoveryConfig, objects: int) -> tuple[dict[str, float]
     each = OBJECT + comb(config.object_views, 2) * PAIR * config.rotations / GRID
     plan = dict.fromkeys(numbered("object", objects), each)
     draws = numbered("draw", len(rows_of_draws(objects, config.draws)))
-    return plan | {f"{draw}, template": FIRST_FIT for draw in draws}, len(draws)
+    return plan | {f"{draw}, template": OBJECTS for draw in draws}, len(draws)
 
 
 def _of_draws(
@@ -100,7 +100,7 @@ def _of_draws(
     count, plan = fitted_of_each(config, len(kinds)) ** len(kinds), dict[str, float]()
     for draw in numbered("draw", config.draws):
         plan[f"{draw}, registration"] = comb(config.seeds, 2) * PAIR * config.rotations / GRID
-        plan[f"{draw}, templates"] = FIRST_FIT * count
+        plan[f"{draw}, templates"] = FIRST_FIT * config.agreeing * config.seeds * count
     return plan, config.draws * min(config.contenders, count)
 
 

@@ -26,8 +26,9 @@ from torch import Tensor
 from scapo.categories import JointKind
 from scapo.geometry.points import Similarity, nearest
 from scapo.geometry.rigid import apply, invert, rigid
+from scapo.method import changes
 from scapo.records import take
-from scapo.registered.config import SearchConfig
+from scapo.registered.config import UNNAMED, SearchConfig
 from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
 from scapo.registered.method import AbstractRegistered, LearnedClouds
@@ -72,6 +73,11 @@ class LabelledRegistered(AbstractRegistered):
 
     name: ClassVar[str] = "registered-labelled"
     supervision: frozenset[Supervision] = frozenset({"segmentation", "pose", "joint", "instance"})
+
+    @property
+    def variant(self) -> str:
+        """Options that differ from the default, but for how much is trained."""
+        return " ".join(changes(self.config, LabelledConfig(), leave=UNNAMED))
 
     def _seconds(self, clouds: int) -> float:
         """Of the template and the losses of true placements."""

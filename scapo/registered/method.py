@@ -36,7 +36,7 @@ from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, chan
 from scapo.pictures import PictureData
 from scapo.records import take
 from scapo.registered.axis_deviation import refine_deviations
-from scapo.registered.config import RegisteredConfig, SearchConfig
+from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, SearchConfig
 from scapo.registered.course import plan_of
 from scapo.registered.decode import metric_limits, nearest_weights, placed_prediction
 from scapo.registered.discovery import Discovery, discover
@@ -123,11 +123,6 @@ class AbstractRegistered(AbstractMethod):
                     nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.pseudo = PseudoLabels()
         self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None
-
-    @property
-    def variant(self) -> str:
-        """Options that differ from the default, but for how much is trained."""
-        return " ".join(changes(self.config, type(self.config)(), leave=("lr", "supervision")))
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's; the template is found before it starts."""
@@ -430,9 +425,11 @@ class TemplateRegistration(AbstractRegistered):
 
     @property
     def variant(self) -> str:
-        """Options that differ from the default, and whether objects were known."""
-        known = ("objects known",) if self.supervision else ()
-        return " ".join((*known, *super().variant.split()))
+        """The preset, whether objects were known, and options that differ from the preset's."""
+        config = self.config
+        words = [] if config.preset == "cpu" else [config.preset]
+        words += ["objects known"] if self.supervision else []
+        return " ".join([*words, *changes(config, PRESETS[config.preset](), leave=UNNAMED)])
 
     def _seconds(self, clouds: int) -> float:
         """Of all steps of a discovery."""

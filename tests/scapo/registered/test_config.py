@@ -1,13 +1,37 @@
 # SPDX-License-Identifier: MIT
-"""Options of discovery: refused values."""
+"""Options of template registration: refused values, and what the quick preset leaves out."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import pytest
 
-from scapo.registered.config import DiscoveryConfig
+from scapo.registered.config import DiscoveryConfig, cpu_config, quick_config
+from scapo.registered.course import plan_of
 
 
 def test_a_grid_too_coarse_is_refused() -> None:
     with pytest.raises(ValueError, match="rotations: expected at least 200, found 150"):
         DiscoveryConfig(rotations=150)
+
+
+def test_the_quick_preset_does_less_of_the_same() -> None:
+    quick, usual = quick_config(), cpu_config()
+    for few, many in (
+        (asdict(quick.discovery), asdict(usual.discovery)),
+        (asdict(quick), asdict(usual)),
+    ):
+        for name, value in many.items():
+            if isinstance(value, tuple):
+                assert len(few[name]) <= len(value), name
+            elif isinstance(value, int):
+                assert few[name] <= value, name
+    assert quick.learned * quick.epochs < 0.1 * usual.learned * usual.epochs
+    for objects in (False, True):
+        seconds = [
+            sum(plan_of(d, ("revolute",), one.learned, objects * d.objects).values())
+            for one in (quick, usual)
+            for d in (one.discovery,)
+        ]
+        assert seconds[0] < 120 < 3 * seconds[0] < seconds[1]

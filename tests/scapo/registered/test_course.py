@@ -112,7 +112,8 @@ def test_the_plan_names_the_steps_that_are_taken(
     plan = plan_of(config, KINDS, 16, objects)
     assert [words for words, _, _ in journal.lines] == list(plan)
     seconds = list(plan.values())
-    assert min(seconds) > 0
+    alone = ["judging first templates", "judging templates"] if objects else []
+    assert [name for name in plan if plan[name] <= 0] == alone
     for k, (_, done, _) in enumerate(journal.lines):
         assert done == pytest.approx(sum(seconds[:k]) / sum(seconds))
     assert light

@@ -14,7 +14,7 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.points import squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Mode, Step
-from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.view_bank import ShownPoints
 from scapo.types import Labels, Observation, Prediction
@@ -195,6 +195,9 @@ def variant(config: RegisteredConfig) -> str:
 
 def test_departures_are_named_and_a_shorter_training_is_not() -> None:
     assert variant(cpu_config()) == ""
+    assert variant(quick_config()) == "quick"
+    told = replace(quick_config(), supervision=("instance",), settle=False)
+    assert variant(told) == "quick objects known settle=False"
     assert variant(RegisteredConfig(learned=20, epochs=1, lr=1.0, batch=2)) == ""
     discovery = DiscoveryConfig(held_frame=False, range_cost=0.0)
     config = RegisteredConfig(strays="kept", settle=False, discovery=discovery)
