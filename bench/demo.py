@@ -29,14 +29,12 @@ from scapo import store
 from scapo.predictor import find, released
 
 RELEASED = "released"
-CALIBRATED = ("scapo", "registered", RELEASED)
-"""Methods that learn without poses: the evaluator fits their part frames on training clouds."""
+CURVED = ("scapo", "registered")
+"""Methods whose training has a curve."""
 PRINTED = ("SCAPO", "ICP")
 METRICS = ("S", "D", "C", "R", "t")
 BESIDE = ("Constant prediction", "Oracle pose", "one part order")
 """Rows that the tables have beside those of methods; the demo's table leaves them out."""
-FITTED_ON = 150
-"""Training clouds, at most, whose answers tell how a method's part frames lie."""
 PICTURED = 8
 TABLE1 = ("laptop", "safe", "eyeglasses", "oven", "washer")
 VIEWS = 3  # Of each object that released models are asked about
@@ -52,7 +50,7 @@ class Demo:
     categories: tuple[str, ...] = ()
     """Categories to run; those of Table 1 with a released model where none is named."""
     train: int = 60
-    """Training clouds per category; released models have their part frames fitted on them."""
+    """Training clouds per category, for `methods` and the constant answer beside them."""
     test: int = 60
     """Test clouds per category."""
     methods: tuple[Literal["scapo", "registered", "icp"], ...] = ()
@@ -128,22 +126,14 @@ def take_joints(demo: Demo, steps: Steps) -> None:
 
 
 def score(demo: Demo, steps: Steps, method: str, run: Path) -> None:
-    """Predict and evaluate; what trained without poses has its frames fitted on training clouds."""
+    """Predict and evaluate; models know the object's frame from their training."""
     data = str(demo.out / "data")
     name = f"{steps.category}-{method}"
     test = str(demo.out / "predictions" / f"{name}-test.safetensors")
     mode = ["--mode", "refine"] if method in ("registered", RELEASED) else []
     steps.bench("predict", str(run), "--data", data, "--split", "test", *mode, "--out", test)
-    calibration: list[str] = []
-    if method in CALIBRATED:
-        train = str(demo.out / "predictions" / f"{name}-train.safetensors")
-        steps.bench(
-            "predict", str(run), "--data", data, "--split", "train", *mode,
-            "--limit", str(FITTED_ON), "--out", train,
-        )  # fmt: skip
-        calibration = ["--calibration", train]
     scores = str(demo.out / "scores" / f"{name}.csv.gz")
-    steps.bench("evaluate", "--predictions", test, *calibration, "--data", data, "--out", scores)
+    steps.bench("evaluate", "--predictions", test, "--data", data, "--out", scores)
 
 
 def make_data(demo: Demo, steps: Steps, data: str) -> None:
@@ -165,7 +155,7 @@ def draw(demo: Demo, category: str) -> None:
     """The training curve and test predictions, evenly spread over the test split."""
     for method in demo.methods:
         curve = demo.out / "runs" / f"{category}-{method}" / "metrics.jsonl"
-        if method in CALIBRATED:
+        if method in CURVED:
             name = "training" if method == "scapo" else f"{method}-training"
             training_curve(curve, demo.out / "pictures" / f"{category}-{name}.png")
     split = store.open_split(demo.out / "data", category, "test")
