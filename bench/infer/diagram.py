@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from bench.figures.drawing import LINE, save
 from bench.infer.calibration import Reliability
 from scapo.drawing import BACKGROUND, PART_COLORS
 
+IN_A_ROW = 5
 TITLES = {"joint": "axis within 5 degrees", "part": "rotation within 10 degrees"}
 
 
@@ -24,11 +26,12 @@ def reliability_picture(kinds: Mapping[str, Reliability], out: Path, title: str)
         out: FILE.png.
         title: Of the figure.
     """
-    figure = Figure(figsize=(4.2 * len(kinds), 4.4), layout="constrained")
+    columns = min(IN_A_ROW, len(kinds))
+    rows = math.ceil(len(kinds) / columns)
+    figure = Figure(figsize=(2.6 * columns, 3.0 * rows + 0.4), layout="constrained")
     figure.suptitle(title)
-    for axes, (kind, one) in zip(
-        np.atleast_1d(figure.subplots(1, len(kinds))), kinds.items(), strict=True
-    ):
+    for place, (kind, one) in enumerate(kinds.items(), start=1):
+        axes = figure.add_subplot(rows, columns, place)
         count = np.array(one.count)
         some, edges = count > 0, np.linspace(0, 1, len(count) + 1)
         axes.bar(

@@ -185,6 +185,10 @@ def read(
             arrays = {name: file.get_tensor(name) for name in wanted}
     except (SafetensorError, TypeError, AttributeError, OSError) as error:
         raise StoreError(f"{path}: expected numpy-readable tensors, found {error}") from error
+    # Where ml_dtypes was imported numpy reads its types too, but only there.
+    odd = [str(array.dtype) for array in arrays.values() if array.dtype.kind == "V"]
+    if odd:
+        raise StoreError(f"{path}: expected numpy-readable tensors, found {odd[0]}")
     return arrays, header
 
 
