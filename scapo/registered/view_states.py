@@ -127,13 +127,16 @@ def synchronised_states(
     every = torch.arange(count)
     best, score = torch.zeros(count, dtype=torch.long), -torch.inf
     for first in range(count):
-        state = table[first].argmax(-1) - most
+        told = table[first].amax(-1) > 0  # Views of which it says nothing stay where it is
+        state = torch.where(told, table[first].argmax(-1) - most, 0)
         state[first] = 0
         for _ in range(SWEEPS):
             before = state.clone()
             for view in range(count):
                 tried = torch.arange(int(state.min()) - BEYOND, int(state.max()) + BEYOND + 1)
-                state[view] = tried[_agreement(table[view], state - tried[:, None], view).argmax()]
+                value = _agreement(table[view], state - tried[:, None], view)
+                if value.max() > value[state[view] - tried[0]]:  # where nothing tells, none drifts
+                    state[view] = tried[value.argmax()]
             if torch.equal(before, state):
                 break
         off = (state - state[:, None]).clamp(-most, most) + most

@@ -30,6 +30,20 @@ def test_states_are_those_whose_differences_score_most(wrong: float) -> None:
     assert score > 0.9
 
 
+def test_views_of_which_nothing_is_known_stay_where_they_are() -> None:
+    state, score = synchronised_states(torch.zeros(6, 6, 49), 0.5)
+    assert torch.equal(state, torch.zeros(6))
+    assert score == 0
+
+
+def test_nothing_that_moved_is_no_motion() -> None:
+    views, truth = sighted(5, seed=7)
+    scene = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
+    found = motion_of(scene, torch.zeros(5, 128, dtype=torch.bool), JOINT, "revolute")
+    assert torch.equal(found.state, torch.zeros(5))
+    assert found.score == 0
+
+
 def test_the_flap_and_its_states_are_found_where_its_hinge_is_known() -> None:
     views, truth = sighted(12, seed=7)
     scene = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
