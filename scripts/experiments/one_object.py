@@ -35,6 +35,13 @@ def middle(turns: torch.Tensor) -> torch.Tensor:
     return project_rotation(turns[near[best].rad2deg() < RIGHT].mean(0))
 
 
+def of_one_size(cloud: torch.Tensor) -> PartialViews:
+    """Views of one object from clouds (B, N, 3), metres, normalised all alike."""
+    points, similarity = normalise(replaced(cloud, inlier_mask(cloud)))
+    views = observe(points, -similarity.centre * similarity.scale[:, None])
+    return views.scaled(similarity.scale.median() / similarity.scale)
+
+
 def main(data: str, category: str, seed: int) -> None:
     """Print a line for each object, the surest first, and one for all of them."""
     split, config = store.dataset(data, category, "train"), DiscoveryConfig()
@@ -46,10 +53,8 @@ def main(data: str, category: str, seed: int) -> None:
     )
     for rows in grouped(instance, config):
         some = [split[int(k)] for k in rows]
-        cloud = torch.stack([torch.as_tensor(one["points"]) for one in some]).float()
-        points, similarity = normalise(replaced(cloud, inlier_mask(cloud)))
-        views = observe(points, -similarity.centre * similarity.scale[:, None])
-        shown.append(views.scaled(similarity.scale.median() / similarity.scale))
+        views = of_one_size(torch.stack([torch.as_tensor(one["points"]) for one in some]).float())
+        shown.append(views)
         for one, first in zip(some, views.points[:, 0].tolist(), strict=True):
             pose = torch.as_tensor(one["camera_T_part"][0]).float()
             truth[tuple(first)] = pose[:3, :3], torch.as_tensor(one["joint_axis"]).float()
