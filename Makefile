@@ -15,7 +15,7 @@ export LP_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup vulkan demo demo-train test test-quick coverage fuzz lint format bench docs lock dist clean
+.PHONY: help setup vulkan demo demo-train test test-slow coverage fuzz lint format bench docs lock dist clean
 
 help: ## these lines
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,11 +33,11 @@ demo-train: setup ## the same of ovens with a model that is trained from scratch
 	@$(BIN)/python -m bench.demo --out results/demo-train --categories oven --train 640 --test 200 \
 	  --methods registered icp $(ARGS)
 
-test: setup ## all tests, shapes checked (JOBS=2, ARGS="-k geometry")
-	@$(BIN)/python -m pytest $(SPREAD) --durations=8 $(ARGS)
+test: setup ## the tests, shapes checked (JOBS=2, ARGS="-k geometry")
+	@$(BIN)/python -m pytest $(SPREAD) --durations=8 -m "not slow" $(ARGS)
 
-test-quick: setup ## without the slow tests
-	@$(BIN)/python -m pytest $(SPREAD) -m "not slow" $(ARGS)
+test-slow: setup ## the slow ones, each of which has a small twin in `make test`
+	@$(BIN)/python -m pytest $(SPREAD) --durations=8 -m slow $(ARGS)
 
 # Shapes unchecked: a checked call that is traced takes three times what either adds alone.
 coverage: setup ## all tests, lines counted: at least 97 %

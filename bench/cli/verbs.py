@@ -6,6 +6,7 @@ A verb asks one function of its room, which is imported only then, and prints th
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -263,9 +264,10 @@ class Demo(requests.DemoRequest):
     """A local page where a file is dropped and what infer makes of it appears."""
 
     def run(self, console: Console) -> None:
-        """Serve until Ctrl-C."""
+        """Serve until Ctrl-C or SIGTERM, which a service manager sends: both clear up."""
         from bench.infer.server import serve
 
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         serve(self, lambda line: say(console, line))
 
 

@@ -111,7 +111,8 @@ def release(request: ReleaseRequest) -> list[Path]:
         raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
     header = {**header, **frame_of_before(method, header, request)}
     source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
-    slim(method, request.out, {**header, "source": sha256_file(source)})
+    public = {**header, "config": without_folders(header["config"])}
+    slim(method, request.out, {**public, "source": sha256_file(source)})
     card = request.out.with_suffix(".md")
     write_bytes(card, card_of(header, request).encode())
     answers = answers_file(request.out)
@@ -231,8 +232,18 @@ def card_of(header: Header, request: ReleaseRequest) -> str:
         frame=frame_sentence(header),
         labels=", ".join(header["supervision"]) or "none",
         scores=scores_table(header, request.scores),
-        config=json.dumps(header["config"], indent=1, sort_keys=True),
+        config=json.dumps(without_folders(header["config"]), indent=1, sort_keys=True),
     )
+
+
+def without_folders(config: Header) -> Header:
+    """A configuration whose `start` is the run's name: its folder is on one machine alone.
+
+    >>> without_folders({"start": "/home/ada/runs/oven-1", "epochs": 3})
+    {'start': 'oven-1', 'epochs': 3}
+    """
+    start = config.get("start")
+    return {**config, "start": Path(start).name} if isinstance(start, str) else config
 
 
 def frame_sentence(header: Header) -> str:

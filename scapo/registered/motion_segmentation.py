@@ -78,7 +78,8 @@ def gather_evidence(
     count: int,
     observers: Int[Tensor, " O"],
 ) -> Evidence:
-    """Support of the first `count` points of every view from the `observers` among the views."""
+    """Support of every view's first `count` points, or all, from the `observers` among them."""
+    count = min(count, views.points.shape[1])
     scale = log_scale.exp()
     columns = []
     for p in range(poses.rotation.shape[1]):

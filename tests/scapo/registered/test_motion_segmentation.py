@@ -38,6 +38,21 @@ def test_evidence_tells_the_parts():
     assert correct.float().mean() > 0.85
 
 
+@torch.no_grad()
+def test_views_of_few_points_give_all_of_them():
+    views, truth = sighted(3, seed=20)
+    there = views.points.shape[1]
+    some, every = (
+        gather_evidence(
+            views, template().part_poses(truth), truth.log_scale,
+            count=count, observers=torch.arange(3),
+        )
+        for count in (there, there + 1)
+    )  # fmt: skip
+    assert every.seen.shape[1] == there
+    torch.testing.assert_close(some.log_support, every.log_support)
+
+
 def test_smoothing_keeps_a_constant():
     views, _ = sighted(2, seed=21)
     assert torch.allclose(smooth(views, torch.full((2, 64, 2), 0.7)), torch.tensor(0.7), atol=1e-4)
