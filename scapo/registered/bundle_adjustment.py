@@ -166,16 +166,20 @@ def refit(
 
 
 def densified(
-    candidate: Candidate, config: DiscoveryConfig, generator: torch.Generator
+    candidate: Candidate, config: DiscoveryConfig, generator: torch.Generator, rounds: int = 1
 ) -> Candidate:
-    """Another template, of `final_points`, built from and fitted to the same views."""
+    """Another template, of `final_points`, built from and fitted to the same views in rounds.
+
+    A point holds its part where a wrong axis puts it, so an axis turns little while points stay.
+    """
     views, placement = candidate.inliers.views, candidate.inliers.placement
     dense = candidate.template.with_points(config.final_points)
-    rebuild(dense, views, placement, generator=generator)
-    if config.way_out:
-        placement = choose_axes(dense, placement, torch.eye(3))
-    options = late_options(dense, config)
-    placement, _ = bundle_adjust(dense, views, placement, options, generator=generator)
+    for number in range(rounds):
+        rebuild(dense, views, placement, generator=generator)
+        if config.way_out and number == 0:
+            placement = choose_axes(dense, placement, torch.eye(3))
+        options = late_options(dense, config)
+        placement, _ = bundle_adjust(dense, views, placement, options, generator=generator)
     return Candidate(template=dense, inliers=Inliers(views=views, placement=placement))
 
 

@@ -70,7 +70,7 @@ def plan_of(
         plan["judging mirror images"] = 4 * (DENSE + judged)
         rounds = rounds[1:]
     plan |= dict.fromkeys(rounds, VIEW * min(config.searched, views) + FIT)
-    plan["dense template"] = DENSE
+    plan["dense template"] = DENSE * config.dense_rounds
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION
     plan["search of all views"] = VIEW * views

@@ -102,7 +102,8 @@ def discover(
     for name, share in zip(rounds, shares, strict=True):
         best = course.step(name, partial(advance, best, searched, share, config, generator))
         logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
-    best = course.step("dense template", partial(densified, best, config, generator))
+    dense = partial(densified, best, config, generator, config.dense_rounds)
+    best = course.step("dense template", dense)
     if config.leans and "revolute" in kinds:
         deviating = partial(with_axis_deviation, best, judges, config, generator)
         best = course.step("deviating axes", deviating)

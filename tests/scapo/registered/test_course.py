@@ -86,7 +86,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         "one_object": lambda *x: known(torch.eye(3), len(made), (0.2, 0.1, 0.1)),
         "object_candidate": lambda *x: candidate("objects", x[-1]),
         "unexplained": lambda one, *_: float(one.template.pivot.detach().sum()),
-        "densified": lambda one, _, g: advancing(copied(one), g),
+        "densified": lambda one, _, g, *more: advancing(copied(one), g),
         "with_axis_deviation": lambda one, *x: advancing(copied(one), *x),
         "advance": advancing,
         "search_views": searching,
