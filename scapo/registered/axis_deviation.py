@@ -40,6 +40,7 @@ from scapo.registered.deviation_model import (
     expected_deviations,
     learn_deviations,
 )
+from scapo.registered.gauge import seat_hinges
 from scapo.registered.gauss_newton import bounded, by_turn, damped_step, point_equations
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.motion_segmentation import rebuild
@@ -73,7 +74,6 @@ RESTS, OUTWARDS = 4, 0.3
 LEAST_POINTS = 12  # Of a part, of those of a view, for its rotation to count
 CHUNK = 64  # Views that are observed at once
 LARGEST = 0.35  # Rotation (rad) that a part is posed with
-SEAT = 0.15  # Share of a part's points, those nearest to its axis, that tell where its pivot sits
 REFINEMENT = StepOptions(steps=4, points=256)  # Steps that follow each observation
 TURNS = 3  # Gauss-Newton steps for each reach
 MEAN_SHARPNESS, SHARPNESS, ALONG = 60.0, 150.0, 0.25
@@ -143,27 +143,12 @@ def _made_thin(
 ) -> tuple[ArticulatedTemplate, PartRotations]:
     """A template whose parts are built from rotated views, and the rotations against it."""
     thin, poses = template.with_points(len(template.points)), None
-    seat_pivots(thin)
+    seat_hinges(thin)
     for reach in FANNED:
         observed = observe_part_rotations(thin, views, placement, (reach,), poses)
         poses = rotated_poses(thin, placement, observed)
         rebuild(thin, views, placement, poses=poses, generator=generator)
     return thin, observe_part_rotations(thin, views, placement, REACHES, poses)
-
-
-@torch.no_grad()
-def seat_pivots(template: ArticulatedTemplate) -> None:
-    """Slide each pivot along its axis to where its part comes near it, in place.
-
-    The category's axis does not care where on it the pivot is; deviating ones turn about it.
-    """
-    part = template.logit.argmax(-1)
-    for j, axis in enumerate(template.directions()):
-        arm = template.points[part == j + 1] - template.pivot[j]
-        if len(arm):
-            along = arm @ axis
-            away = (arm - along[:, None] * axis).norm(dim=-1)
-            template.pivot[j] += axis * along[away <= away.quantile(SEAT)].median()
 
 
 def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:

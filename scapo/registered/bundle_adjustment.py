@@ -20,7 +20,13 @@ from scapo.categories import JointKind
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import map_tensors
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.gauge import along_main_directions, choose_axes, settle_hinges, tells_frame
+from scapo.registered.gauge import (
+    along_main_directions,
+    choose_axes,
+    seat_hinges,
+    settle_hinges,
+    tells_frame,
+)
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.motion_segmentation import rebuild
 from scapo.registered.pose_refinement import SCALE_WEIGHT, SHIFT_WEIGHT, SLIDE_WEIGHT, search_states
@@ -209,6 +215,8 @@ def bundle_adjust(
     Returns:
         The placements and the loss of each view at the last step.
     """
+    if not template.deviates():
+        seat_hinges(template)
     free = _Free(start, template)
     shared = _groups(
         (template.points, POINT_RATE),

@@ -16,6 +16,7 @@ from scapo.registered.gauge import (
     choose_axes,
     principal_frame,
     protrusion,
+    seat_hinges,
     settle_hinges,
     tells_frame,
 )
@@ -166,3 +167,14 @@ def test_a_hinge_that_is_right_stays():
     shape, placement = template(), hinged_elsewhere(200, 6)
     settle_hinges(shape, replace(placement, shift=torch.zeros_like(placement.shift)))
     assert_close(shape.pivot.detach()[0], PIVOT, atol=1e-4, rtol=0)
+
+
+def test_pivots_slide_to_their_part_and_axes_have_length_one() -> None:
+    made = template()
+    with torch.no_grad():
+        made.pivot[0, 1] += 0.7
+        made.axis[0] *= 8
+    seat_hinges(made)
+    assert made.pivot[0, 1].abs() < 0.1
+    assert_close(made.pivot[0, [0, 2]].detach(), torch.tensor([-0.2, -0.15]))
+    assert_close(made.axis[0].norm().detach(), torch.tensor(1.0))
