@@ -45,6 +45,9 @@ class ScapoConfig:
     """Training clouds that this run is asked for, about 0.06 s each on one core."""
     bones_turn: bool = False
     """V of a bone turns with its part (BANMo); otherwise it is the same in every state."""
+    labels_of: Literal["skinning", "template"] = "skinning"
+    """Whose weights a prediction gives: w of the bones on S_obj, or those of the nearest point of
+    the posed template, which ends at the hinge where two Gaussians do not."""
     encoder_in_stage_2: Literal["joint", "frozen", "end-to-end"] = "joint"
     """joint: frozen for the first half, then a tenth of the rate; end-to-end: all of it."""
     supervision: tuple[Literal["segmentation", "joint"], ...] = ()
@@ -130,6 +133,7 @@ def complete_config() -> ScapoConfig:
         ),
         part_start="search",
         bones_turn=True,
+        labels_of="template",
         epochs=(5, 5),
     )
 

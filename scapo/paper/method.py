@@ -42,7 +42,7 @@ from scapo.paper.heads import (
 )
 from scapo.paper.objectives import Explanation, articulation, canonicalisation
 from scapo.paper.part_search import PartSearch, Skeleton, motionless
-from scapo.paper.refine import refine
+from scapo.paper.refine import nearest_template_weights, refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.vector_neurons import initialise
 from scapo.paper.warm_start import WarmStart, imitation, load_run
@@ -343,7 +343,8 @@ class Scapo(AbstractMethod):
 
         The part frames are the template's: every part's pose carries the template onto the
         cloud. States are those of the cloud minus the template's. `refine` moves pose and joints
-        of each cloud until the posed template fits it (not in the paper).
+        of each cloud until the posed template fits it, `labels_of` takes the template's weights
+        (neither in the paper).
         """
         points, similarity = normalise(observation.points)
         explanation = self.explain(points)
@@ -354,9 +355,11 @@ class Scapo(AbstractMethod):
         pose = rigid(encoding.rotation, encoding.translation)[:, None] @ maps
         state = joints.relative() - explanation.template_joints.relative()
         slide = torch.tensor([kind == "prismatic" for kind in self.kinds], device=state.device)
-        scale = similarity.scale[:, None]
+        scale, weights = similarity.scale[:, None], explanation.weights
+        if self.config.labels_of == "template":
+            weights = nearest_template_weights(points, explanation, self.kinds)
         return Prediction(
-            part_weight=explanation.weights,
+            part_weight=weights,
             camera_T_part=similarity.inverse_pose(pose),
             joints=Joints(
                 pivot=similarity.inverse(encoding.place(joints.pivot)),

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import squared_distances
+from scapo.geometry.points import gather, nearest, squared_distances
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation
@@ -26,12 +26,33 @@ SHARPNESS = (30.0, 120.0)
 """Of the robust distances, cloud to template and back (OP-Align's)."""
 
 
+def posed_template(e: Explanation, kinds: tuple[JointKind, ...]) -> Float[Tensor, "B M 3"]:
+    """D_{Y->X} on Y_X, in the input frame: where the template lies in each cloud."""
+    maps = part_maps(cross_maps(e.template_joints, e.joints, kinds))
+    return e.encoding.place(deform(maps, e.template, e.template_weights))
+
+
+def nearest_template_weights(
+    points: Float[Tensor, "B N 3"], e: Explanation, kinds: tuple[JointKind, ...]
+) -> Float[Tensor, "B N P"]:
+    """The weights of the nearest point of the posed template.
+
+    Not in the paper, whose segmentation is w on S_obj. There two Gaussian bones meet in a quadric,
+    which two plates that share a hinge do not; w on the template was fitted to all clouds at once.
+
+    Args:
+        points: Input frame.
+        e: What the networks say of them.
+        kinds: Of the joints.
+    """
+    return gather(e.template_weights, nearest(points, posed_template(e, kinds)))
+
+
 def misfit(
     points: Float[Tensor, "B N 3"], e: Explanation, kinds: tuple[JointKind, ...]
 ) -> Float[Tensor, " B"]:
     """How badly the posed template explains each cloud; a few outliers cost a bounded amount."""
-    maps = part_maps(cross_maps(e.template_joints, e.joints, kinds))
-    posed = e.encoding.place(deform(maps, e.template, e.template_weights))
+    posed = posed_template(e, kinds)
     there, back = SHARPNESS
     seen = (1 - torch.exp(-there * squared_distances(points, posed))).mean(-1)
     unseen = (1 - torch.exp(-back * squared_distances(posed, points))).mean(-1)

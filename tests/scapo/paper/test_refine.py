@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.testing import assert_close
 
 from scapo.categories import JointKind
-from scapo.paper.refine import misfit, moved, refine
+from scapo.geometry.points import normalise
+from scapo.paper.refine import misfit, moved, posed_template, refine
 from scapo.types import Observation
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import normal
-from tests.helpers.tiny import tiny
+from tests.helpers.tiny import TINY, tiny
 from tests.scapo.paper.test_objectives import explanation
 
 
@@ -65,3 +68,17 @@ def test_predict_refines_on_demand_and_leaves_weights_alone() -> None:
     assert not slow.joints.pivot.requires_grad
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert all(parameter.grad is None for parameter in model.parameters())
+
+
+def test_labels_of_the_template_are_those_of_its_nearest_point() -> None:
+    model = tiny(config=replace(TINY, labels_of="template")).eval()
+    points = plates(3, 96)[0].points
+    with torch.no_grad():
+        cloud, _ = normalise(points)
+        e = model.explain(cloud)
+        posed = posed_template(e, model.kinds)
+    found = model.predict(Observation(points=points)).part_weight
+    index = torch.cdist(cloud, posed).argmin(-1)
+    expected = torch.stack([w[i] for w, i in zip(e.template_weights, index, strict=True)])
+    assert_close(found, expected)
+    assert not torch.equal(found, e.weights)
