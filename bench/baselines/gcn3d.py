@@ -58,7 +58,7 @@ def cpu_config() -> Gcn3dConfig:
         support=3,
         widths=(32, 32, 64, 64, 128),
         fuse=(128, 128),
-        learning=LearningConfig(points=128, dropout=0.0, epochs=20, lr=2e-3, batch=32),
+        learning=LearningConfig(points=128, dropout=0.0, rotated=0.0, epochs=30, lr=2e-3, batch=32),
     )
 
 

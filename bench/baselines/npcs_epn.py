@@ -109,6 +109,7 @@ def cpu_config() -> NpcsEpnConfig:
             head=(128, 96),
             recompute=False,
         ),
+        rotated=0.0,
         epochs=12,
         lr=3e-3,
         decay_every=None,
