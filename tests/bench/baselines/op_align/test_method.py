@@ -22,6 +22,7 @@ from bench.baselines.op_align.method import OpAlign, OpAlignConfig, cpu_config, 
 from bench.compat.chain import Chain, inverse_chain
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron
+from scapo.equivariant.e2pn import QuotientBlock
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply
 from scapo.method import Step, StepDecay
@@ -252,6 +253,23 @@ def test_schedules_halve_rate_and_rigid_share_together() -> None:
     assert OpAlignConfig().decay_every == 16
     assert (stage.lr, stage.weight_decay) == (1e-4, 1e-8)
     assert stage.schedule == StepDecay(every=16, factor=0.5)
+
+
+def test_the_lean_schedule_has_the_four_published_levels() -> None:
+    for config in (OpAlignConfig(), cpu_config()):
+        assert config.epochs == 4 * config.decay_every
+
+
+@torch.no_grad()
+def test_grey_says_the_same_in_training_and_after() -> None:
+    backbone, points = tiny().backbone, normal(0, 2, 48, 3).float()
+    first, seen = backbone.blocks[0], []
+    assert isinstance(first, QuotientBlock)
+    first.skip.register_forward_hook(lambda *seen_now: seen.append(seen_now[-1]))
+    first.skip.linear.weight.add_(0.1)  # a step since the statistics of the last batch
+    for training in (False, True):
+        backbone.train(training)(points, torch.full_like(points, 0.5))
+    assert torch.equal(seen[0], seen[1])
 
 
 def test_three_parts_agree_on_the_base() -> None:
