@@ -263,7 +263,8 @@ def test_the_lean_schedule_has_the_four_published_levels() -> None:
 @torch.no_grad()
 def test_grey_says_the_same_in_training_and_after() -> None:
     backbone, points = tiny().backbone, normal(0, 2, 48, 3).float()
-    first, seen = backbone.blocks[0], []
+    first = backbone.blocks[0]
+    seen: list[Tensor] = []
     assert isinstance(first, QuotientBlock)
     first.skip.register_forward_hook(lambda *seen_now: seen.append(seen_now[-1]))
     first.skip.linear.weight.add_(0.1)  # a step since the statistics of the last batch
