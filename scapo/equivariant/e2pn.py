@@ -86,14 +86,20 @@ class QuotientBlock(nn.Module):
     """The convolution with its norm, and a 1 x 1 skip from each centre's own features."""
 
     def __init__(
-        self, inputs: int, outputs: int, *, slope: float = 0.0, recompute: bool = False
+        self,
+        inputs: int,
+        outputs: int,
+        *,
+        slope: float = 0.0,
+        recompute: bool = False,
+        skip_norm: bool = True,
     ) -> None:
-        """ReLU, leaky with this `slope`."""
+        """ReLU, leaky with this `slope`; without `skip_norm` where inputs can be constant."""
         super().__init__()
         self.slope = slope
         self.conv = QuotientConv(inputs, outputs, recompute=recompute)
         self.norm = ChannelNorm(outputs)
-        self.skip = Skip(inputs, outputs)
+        self.skip = Skip(inputs, outputs, norm=skip_norm)
 
     def forward(
         self, features: Float[Tensor, "B M A C"], near: Neighbourhood

@@ -103,10 +103,15 @@ class ChannelNorm(nn.BatchNorm1d):
 class Skip(nn.Module):
     """A 1 x 1 layer from each centre's own features."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, *, norm: bool = True) -> None:
+        """Without `norm` where features can be constant, such as ones.
+
+        A batch of them has no variance: in training the norm gives its bias alone, and later it
+        divides by next to nothing how far the weights have moved since its running mean.
+        """
         super().__init__()
         self.linear = nn.Linear(inputs, outputs, bias=False)
-        self.norm = ChannelNorm(outputs)
+        self.norm = ChannelNorm(outputs) if norm else nn.Identity()
 
     def forward(
         self, features: Float[Tensor, "B M A C"], near: Neighbourhood

@@ -66,10 +66,16 @@ class Encoder(nn.Module):
         self.config = config
         sizes = zip([1, *config.channels], config.channels, strict=False)
         self.blocks = nn.ModuleList(
-            SeparableBlock(inputs, outputs, slope=SLOPE, recompute=config.recompute)
+            SeparableBlock(
+                inputs,
+                outputs,
+                slope=SLOPE,
+                recompute=config.recompute,
+                skip_norm=number > 0,  # the first block sees ones
+            )
             if group
             else PointBlock(inputs, outputs, recompute=config.recompute)
-            for inputs, outputs in sizes
+            for number, (inputs, outputs) in enumerate(sizes)
         )
 
     def forward(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 60 C"]:

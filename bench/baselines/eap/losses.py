@@ -26,38 +26,23 @@ def shape_distances(
     return there + squared_distances(shapes, clouds).mean(-1)
 
 
-def members_alone(
-    points: Float[Tensor, "B N 3"], member: Bool[Tensor, "B N S"]
-) -> Float[Tensor, "B S N 3"]:
-    """The cloud of each slot: its members, and one of them in the place of every other point.
-
-    A slot without members has the first point of the cloud throughout.
-    """
-    first = member.long().argmax(1)  # (B, S)
-    stand_in = points.gather(1, first[..., None].expand(-1, -1, 3))
-    return torch.where(member.mT[..., None], points[:, None], stand_in[:, :, None])
-
-
 def slot_distances(
     posed: Float[Tensor, "B S K M 3"],
     points: Float[Tensor, "B N 3"],
     weights: Float[Tensor, "B N S"],
-) -> Float[Tensor, "B S K"]:
-    """Each slot's shape from the points that the slot has won, both ways; 0 for a slot with none.
+) -> Float[Tensor, "B K"]:
+    """Every point from every slot's shape, as far as its weight gives it to that slot.
 
-    Points count by their weight of the slot, the shape's points alike.
+    One way: squared distance of a point to the nearest of the slot's shape times its weight of
+    the slot, summed over slots, mean over points. So the weights are drawn to the slot that fits.
 
     Args:
         posed: Shapes of all slots under K hypotheses.
         points: The cloud.
-        weights: Of the slots.
+        weights: Of the slots, rows on the simplex.
     """
-    member = torch.nn.functional.one_hot(weights.argmax(-1), weights.shape[-1]).bool()
-    own = members_alone(points, member)[:, :, None].expand(-1, -1, posed.shape[2], -1, -1)
-    share = (weights * member).mT[:, :, None]  # (B, S, 1, N)
-    there = (squared_distances(own, posed) * share).sum(-1) / share.sum(-1).clamp_min(1e-8)
-    back = squared_distances(posed, own).mean(-1)
-    return (there + back) * member.any(1)[..., None]
+    cloud = points[:, None, None].expand(-1, *posed.shape[1:3], -1, -1)
+    return (squared_distances(cloud, posed) * weights.mT[:, :, None]).sum(1).mean(-1)
 
 
 def whole(

@@ -25,6 +25,7 @@ from scapo.geometry.points import gather, nearest, normalise
 from scapo.geometry.rigid import rigid
 from scapo.method import (
     AbstractMethod,
+    HalfCosine,
     Mode,
     ParameterGroup,
     Stage,
@@ -86,7 +87,11 @@ class EapConfig:
     min_lr: float = 1e-7
     """Least learning rate."""
     decay: float = 0.64
-    """Factor of the learning rate every 2 epochs: 0.7 every 1,000 steps of 8 clouds of 5,000."""
+    """Factor of the learning rate every `decay_every` epochs: published, 0.7 every 1,000 steps of
+    8 clouds, is this where there are 5,000 of them."""
+    decay_every: int | None = 2
+    """Epochs; None: half a cosine in each stage down to `min_lr` instead, however few epochs it
+    has."""
     weight_decay: float = 1e-8
     """Added to the gradient, times the weights."""
     batch: int = 8
@@ -97,17 +102,19 @@ def cpu_config() -> EapConfig:
     """The lean preset: the same structure with fewer points and channels, one pass."""
     return EapConfig(
         preset="cpu",
-        points=96,
-        encoder=EncoderConfig(channels=(8, 16, 32), radii=(0.16, 0.22, 0.32), neighbours=12),
-        whole=WholeConfig(width=48, points=128, chosen_by=96),
-        parts=PartConfig(width=48, points=48, passes=1),
-        epochs=(4, 4),
+        points=64,
+        encoder=EncoderConfig(channels=(8, 16, 16), radii=(0.19, 0.26, 0.38), neighbours=8),
+        whole=WholeConfig(width=48, points=96, chosen_by=64),
+        parts=PartConfig(width=48, points=40, passes=1),
+        loss=LossConfig(pivot=0.1),  # 1 outweighs both reconstructions at the start
+        epochs=(4, 2),
         lr=1e-3,
-        batch=16,
+        min_lr=1e-5,
+        decay_every=None,
     )
 
 
-UNNAMED = frozenset({"preset", "lr", "min_lr", "weight_decay", "decay"})
+UNNAMED = frozenset({"preset", "lr", "min_lr", "weight_decay", "decay", "decay_every"})
 """Options that make no other variant."""
 
 
@@ -151,6 +158,7 @@ class Eap(AbstractMethod):
     def stages(self) -> tuple[Stage, ...]:
         """The whole object, then the parts with the whole frozen, then a count without steps."""
         config = self.config
+        every = config.decay_every
         modules = ("whole_stage", "part_stage", "part_stage")
         return tuple(
             Stage(
@@ -161,7 +169,9 @@ class Eap(AbstractMethod):
                 weight_decay=config.weight_decay,
                 batch=config.batch,
                 parameters=(ParameterGroup(module=module),),
-                schedule=StepDecay(every=2, factor=config.decay),
+                schedule=HalfCosine()
+                if every is None
+                else StepDecay(every=every, factor=config.decay),
             )
             for name, module, epochs in zip(
                 (WHOLE, PARTS, USUAL), modules, (*config.epochs, 0), strict=True

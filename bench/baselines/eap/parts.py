@@ -56,7 +56,8 @@ class Kinematics:
     shapes: Float[Tensor, "B S M 3"]
     """Placed, not moved."""
     pivots: Float[Tensor, "B S 3"]
-    """Of the joint between each slot and the base; the base's own has no meaning."""
+    """Of the joint between each slot and the base; the base's own has no meaning. Two slots have
+    one in common."""
     axis: Float[Tensor, "B K 3"]
     """Unit vector, of all joints."""
     states: Float[Tensor, "B S K"]
@@ -129,7 +130,7 @@ class Pass:
         slots = losses.slot_distances(posed[:, :, None], self.points, self.weights)
         terms = {
             "whole": losses.whole(posed, self.points, self.present()),
-            "slots": slots[..., 0].sum(1).mean(),
+            "slots": slots.mean(),
         }
         if self.chosen.kind == "revolute":
             terms["pivot"] = self._pivots(steps)
@@ -209,7 +210,8 @@ class PartStage(nn.Module):
         self.angles = nn.ModuleList(PerAnchor(width, 1) for _ in range(slots))
         self.shapes = nn.ModuleList(ShapeDecoder(width, width, config.points) for _ in range(slots))
         self.centres = nn.ModuleList(ShapeDecoder(width, width, 1) for _ in range(slots))
-        self.pivots = nn.ModuleList(ShapeDecoder(width, width, 1) for _ in range(slots))
+        joints = slots if slots > 2 else 1  # two slots turn about one, whichever is the base
+        self.pivots = nn.ModuleList(ShapeDecoder(width, width, 1) for _ in range(joints))
 
     def forward(
         self, clouds: Float[Tensor, "B S N 3"], label: Int[Tensor, "B N"] | None, usual: Usual
@@ -270,7 +272,9 @@ class PartStage(nn.Module):
         biggest = member.sum(1).argmax(-1)
         return Kinematics(
             shapes=torch.stack(shapes, 1),
-            pivots=torch.cat([one(whole.code) for one in self.pivots], 1),
+            pivots=torch.cat([one(whole.code) for one in self.pivots], 1).expand(
+                -1, self.slots, -1
+            ),
             axis=F.normalize(self.axis(whole.anchors), dim=-1),
             states=reach * torch.stack(states, 1),
             base=biggest if base is None else torch.full_like(biggest, base),
@@ -281,10 +285,10 @@ class PartStage(nn.Module):
     def _best(
         self, found: Kinematics, points: Float[Tensor, "B N 3"], weights: Float[Tensor, "B N S"]
     ) -> Int[Tensor, " B"]:
-        """The anchor under which all slots' shapes fit their points best."""
+        """The anchor under which all slots' shapes fit the points best."""
         moved = apply(found.motions(), found.shapes[:, :, None])  # (B, S, 60, M, 3)
         posed = moved @ cast("Tensor", self.whole_readout.rotations).mT
-        return losses.slot_distances(posed, points, weights).sum(1).argmin(-1)
+        return losses.slot_distances(posed, points, weights).argmin(-1)
 
     def passes(self, aligned: Float[Tensor, "B N 3"], usual: Usual) -> list[Passed]:
         """All passes over clouds that stage 0 has aligned."""

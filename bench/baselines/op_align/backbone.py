@@ -74,8 +74,14 @@ class Backbone(nn.Module):
         ]
         self.blocks = nn.ModuleList(
             [
-                QuotientBlock(inputs, outputs, slope=SLOPE, recompute=config.recompute)
-                for inputs, outputs in zip([3, *sizes], sizes, strict=False)
+                QuotientBlock(
+                    inputs,
+                    outputs,
+                    slope=SLOPE,
+                    recompute=config.recompute,
+                    skip_norm=number > 0,  # colours are one grey where the data have none
+                )
+                for number, (inputs, outputs) in enumerate(zip([3, *sizes], sizes, strict=False))
             ]
         )
         self.pools = nn.ModuleList([PointPool(size, size, VERTICES) for size in config.channels])

@@ -11,6 +11,7 @@ R^T x - t under the chosen hypothesis; `canonical`, the decoder's shape.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
@@ -137,14 +138,16 @@ def cpu_config() -> OpAlignConfig:
     return OpAlignConfig(
         preset="cpu",
         backbone=BackboneConfig(channels=(8, 16, 32, 64), radius=0.25, neighbours=16, points=128),
-        hypotheses=HypothesisConfig(pooled=32, width=128, hidden=32, code=64),
+        hypotheses=HypothesisConfig(
+            pooled=32, width=128, hidden=32, code=64, residual_range=math.pi / 4
+        ),
         decoder=DecoderConfig(width=128, points=256),
         point_net=PointNetConfig(width=48, blocks=5, segmentation=(32, 16), joint=(64, 32)),
         loss=LossConfig(density_neighbours=16),
         points=256,
         chosen_by=96,
         epochs=8,
-        decay_every=3,
+        decay_every=2,
         lr=1e-3,
     )
 

@@ -71,6 +71,17 @@ def test_the_skip_is_each_centres_own() -> None:
     assert_close(skip(features, near)[0, 1, 1], skip.norm(skip.linear(features[0, 2, 1])))
 
 
+def test_a_skip_from_constant_features_is_the_same_in_training_and_after() -> None:
+    points, ones = normal(6, 2, 8, 3), torch.ones(2, 8, 1, 1).double()
+    near = neighbourhood(points, torch.tensor([[5, 2], [0, 1]]), 1.0, 4)
+    skip = Skip(1, 4, norm=False).double()
+    for _ in range(40):  # steps that running statistics would lag behind
+        skip(ones, near)
+        with torch.no_grad():
+            skip.linear.weight.add_(0.1)
+    assert torch.equal(skip.train()(ones, near), skip.eval()(ones, near))
+
+
 @pytest.mark.parametrize("anchors", [60, 12])
 def test_pooled_points_turn_with_the_cloud(anchors: int) -> None:
     pool = PointPool(3, 4, anchors).double()

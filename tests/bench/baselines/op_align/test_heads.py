@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from bench.baselines.op_align.heads import (
     PointNetConfig,
     PointNetwork,
 )
+from bench.baselines.op_align.method import OpAlign, cpu_config
 from scapo.categories import CATEGORIES
 from scapo.paper.vector_neurons import initialise
 from tests.helpers.strategies import generator, is_rotation, normal
@@ -27,23 +29,43 @@ ANCHORS = torch.from_numpy(Rotation.create_group("I").as_matrix()).float()
 SMALL = HypothesisConfig(pooled=8, width=16, hidden=8, code=6)
 
 
-def head() -> HypothesisHead:
-    made = HypothesisHead(SMALL, 12, ANCHORS)
+def head(config: HypothesisConfig = SMALL) -> HypothesisHead:
+    made = HypothesisHead(config, 12, ANCHORS)
     initialise(made, generator(0))
     with torch.no_grad():
-        made.residual[-1].weight.mul_(30)  # pyright: ignore[reportCallIssue]
+        made.turn.weight.mul_(30)
+        made.shift.weight.copy_(normal(4, 3, 8))
     return made.eval()
 
 
+@pytest.mark.parametrize("reach", [math.pi / 10, math.pi / 4])
 @torch.no_grad()
-def test_hypotheses_stay_within_eighteen_degrees_of_their_anchors() -> None:
-    said = head()(normal(0, 3, 60, 12).float())
+def test_hypotheses_stay_within_the_range_of_their_anchors(reach: float) -> None:
+    said = head(replace(SMALL, residual_range=reach))(normal(0, 3, 60, 12).float())
     assert is_rotation(said.rotation).all()
     turn = (ANCHORS.mT @ said.rotation).double().numpy()
     angle = Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude()
-    assert angle.max() <= math.pi / 10 + 1e-5
-    assert angle.max() > math.pi / 20
+    assert angle.max() <= reach + 1e-5
+    assert angle.max() > reach / 2
     assert_close(said.attention.sum(-1), torch.ones(3))
+
+
+def test_the_published_range_leaves_gaps_and_the_lean_one_none() -> None:
+    some = Rotation.random(4000, rng=np.random.default_rng(0))
+    group = Rotation.create_group("I")
+    off = np.min([(one.inv() * some).magnitude() for one in group], 0)
+    assert np.degrees(off.mean()) == pytest.approx(29.6, abs=0.3)
+    assert HypothesisConfig().residual_range == pytest.approx(math.pi / 10)
+    assert (off > HypothesisConfig().residual_range).mean() > 0.8
+    assert off.max() < cpu_config().hypotheses.residual_range
+
+
+@torch.no_grad()
+def test_shapes_and_translations_start_where_gradients_reach_them() -> None:
+    made = OpAlign(cpu_config(), CATEGORIES["laptop"], generator(0)).train()
+    said = made.head(normal(0, 16, 60, made.backbone.outputs).float())
+    assert not said.translation.any()
+    assert not made.decoder(said.code).offset.any()
 
 
 @torch.no_grad()
@@ -61,8 +83,11 @@ def test_another_order_of_the_rotations_orders_the_residuals_and_leaves_the_code
 def test_the_decoder_moves_a_shared_base() -> None:
     decoder = Decoder(DecoderConfig(width=8, points=20), 6, color=False)
     initialise(decoder, generator(0))
+    with torch.no_grad():
+        decoder.offset[-1].weight.copy_(normal(1, 60, 8))  # pyright: ignore[reportCallIssue]
     assert float(decoder.base.detach().abs().max()) <= math.sqrt(6 / 23)
     shape = decoder.eval()(normal(0, 3, 6).float())
+    assert float(shape.offset.detach().abs().max()) > 0.1
     assert_close(shape.points - shape.offset, decoder.base.expand(3, -1, -1))
     assert shape.color is None
     tinted = Decoder(DecoderConfig(width=8, points=20), 6, color=True)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import pi
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from bench.baselines.op_align.method import OpAlign, OpAlignConfig, cpu_config, 
 from bench.compat.chain import Chain, inverse_chain
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron
+from scapo.equivariant.e2pn import QuotientBlock
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply
 from scapo.method import Step, StepDecay
@@ -35,7 +37,7 @@ TINY = replace(
     backbone=BackboneConfig(
         channels=(4, 8), depth=(2, 1), radius=0.25, neighbours=8, points=48, sampling="stride"
     ),
-    hypotheses=HypothesisConfig(pooled=8, width=16, hidden=8, code=8),
+    hypotheses=HypothesisConfig(pooled=8, width=16, hidden=8, code=8, residual_range=pi / 4),
     decoder=DecoderConfig(width=16, points=40),
     point_net=PointNetConfig(width=8, blocks=2, segmentation=(8,), joint=(8, 8)),
     chosen_by=None,
@@ -254,6 +256,24 @@ def test_schedules_halve_rate_and_rigid_share_together() -> None:
     assert stage.schedule == StepDecay(every=16, factor=0.5)
 
 
+def test_the_lean_schedule_has_the_four_published_levels() -> None:
+    for config in (OpAlignConfig(), cpu_config()):
+        assert config.epochs == 4 * config.decay_every
+
+
+@torch.no_grad()
+def test_grey_says_the_same_in_training_and_after() -> None:
+    backbone, points = tiny().backbone, normal(0, 2, 48, 3).float()
+    first = backbone.blocks[0]
+    seen: list[Tensor] = []
+    assert isinstance(first, QuotientBlock)
+    first.skip.register_forward_hook(lambda *seen_now: seen.append(seen_now[-1]))
+    first.skip.linear.weight.add_(0.1)  # a step since the statistics of the last batch
+    for training in (False, True):
+        backbone.train(training)(points, torch.full_like(points, 0.5))
+    assert torch.equal(seen[0], seen[1])
+
+
 def test_three_parts_agree_on_the_base() -> None:
     made = tiny("eyeglasses").train()
     observation, _ = labelled(4)
@@ -299,17 +319,19 @@ def test_colours_reach_the_network_and_grey_is_a_half() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rounds", "share"), [(40, 0.9), pytest.param(400, 0.15, marks=pytest.mark.slow)]
+    ("rounds", "share"), [(40, 0.9), pytest.param(400, 0.25, marks=pytest.mark.slow)]
 )
 def test_it_overfits_a_batch(rounds: int, share: float) -> None:
+    """By its whole objective: offsets, which could explain any cloud, cost something too."""
     made = OpAlign(replace(TINY, direction_noise=0.0), CATEGORIES["laptop"], generator(0)).train()
     observation, _ = plates(4, 48, 2)
     optimiser = torch.optim.Adam(made.parameters(), lr=5e-3)
     curve = []
     for number in range(rounds):
         terms = made.losses(observation, Labels(), step(number))
-        curve.append(float((terms["rigid"] + terms["art"]).detach()))
+        loss = torch.stack(list(terms.values())).sum()
+        curve.append(float(loss.detach()))
         optimiser.zero_grad()
-        torch.stack(list(terms.values())).sum().backward()
+        loss.backward()
         optimiser.step()
     assert np.mean(curve[-5:]) < share * np.mean(curve[:3])
