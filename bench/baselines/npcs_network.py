@@ -81,8 +81,8 @@ class NpcsNetwork(nn.Module):
         )
         inputs = (1, *config.widths[:-1])
         self.blocks = nn.ModuleList(
-            SeparableBlock(i, o, recompute=config.recompute)
-            for i, o in zip(inputs, config.widths, strict=True)
+            SeparableBlock(i, o, recompute=config.recompute, skip_norm=number > 0)  # first: ones
+            for number, (i, o) in enumerate(zip(inputs, config.widths, strict=True))
         )
         self.pools = nn.ModuleList(
             PointPool(width, config.code, ROTATIONS) for width in config.widths
