@@ -239,7 +239,7 @@ def card_of(header: Header, request: ReleaseRequest) -> str:
 def without_folders(config: Header) -> Header:
     """A configuration whose `start` is the run's name: its folder is on one machine alone.
 
-    >>> without_folders({"start": "/home/ada/runs/oven-1", "epochs": 3})
+    >>> without_folders({"start": "OUT/runs/clean/oven-1", "epochs": 3})
     {'start': 'oven-1', 'epochs': 3}
     """
     start = config.get("start")

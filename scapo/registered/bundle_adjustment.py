@@ -218,13 +218,7 @@ def bundle_adjust(
     if not template.deviates():
         seat_hinges(template)
     free = _Free(start, template)
-    shared = _groups(
-        (template.points, POINT_RATE),
-        (template.logit, LOGIT_RATE),
-        (template.axis, AXIS_RATE),
-        (template.pivot, PIVOT_RATE),
-    )
-    optimiser = torch.optim.Adam([*free.groups, *shared], betas=BETAS)
+    optimiser = torch.optim.Adam([*free.groups, *_shared(template)], betas=BETAS)
     rates = [group["lr"] for group in optimiser.param_groups]
     loss = start.translation.new_zeros(len(start.translation))
     for step, sharpness in enumerate(sharpened(options.sharpness, options.steps)):
@@ -279,6 +273,15 @@ class _Free:
             shift=self.shift - along,
             deviation=self.start.deviation,
         )
+
+
+def _shared(template: ArticulatedTemplate) -> list[dict[str, object]]:
+    return _groups(
+        (template.points, POINT_RATE),
+        (template.logit, LOGIT_RATE),
+        (template.axis, AXIS_RATE),
+        (template.pivot, PIVOT_RATE),
+    )
 
 
 def _groups(*rates: tuple[Tensor, float]) -> list[dict[str, object]]:

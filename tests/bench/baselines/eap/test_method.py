@@ -291,7 +291,8 @@ def test_all_points_take_the_weights_of_their_nearest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rounds", "shares"), [(25, (0.8, 0.9)), pytest.param(300, (0.15, 0.25), marks=pytest.mark.slow)]
+    ("rounds", "shares"),
+    [(25, (0.8, 0.9)), pytest.param(300, (0.15, 0.25), marks=pytest.mark.slow)],
 )
 def test_each_stage_overfits_a_batch(rounds: int, shares: tuple[float, float]) -> None:
     config = replace(TINY, parts=replace(TINY.parts, passes=1))
