@@ -36,7 +36,7 @@ demo-train: setup ## the same of ovens with a model that is trained from scratch
 test: setup ## the tests, shapes checked (JOBS=2, ARGS="-k geometry")
 	@$(BIN)/python -m pytest $(SPREAD) --durations=8 -m "not slow" $(ARGS)
 
-test-slow: setup ## the slow ones, each of which has a small twin in `make test`
+test-slow: setup ## the slow ones
 	@$(BIN)/python -m pytest $(SPREAD) --durations=8 -m slow $(ARGS)
 
 # Shapes unchecked: a checked call that is traced takes three times what either adds alone.

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from bench.baselines.body import Body, Features
-from bench.baselines.supervised import LearningConfig, SupervisedMethod
+from bench.baselines.supervised import LEAN, LearningConfig, SupervisedMethod
 from scapo.categories import Category
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import gather, k_nearest, nearest
@@ -58,7 +58,7 @@ def cpu_config() -> Gcn3dConfig:
         support=3,
         widths=(32, 32, 64, 64, 128),
         fuse=(128, 128),
-        learning=LearningConfig(points=128, dropout=0.0, rotated=0.0, epochs=30, lr=2e-3, batch=32),
+        learning=LEAN,
     )
 
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from bench.baselines.body import Block, Body, Features
-from bench.baselines.supervised import LearningConfig, SupervisedMethod
+from bench.baselines.supervised import LEAN, LearningConfig, SupervisedMethod
 from scapo.categories import Category
 from scapo.geometry.points import farthest_points, gather, k_nearest
 
@@ -74,7 +74,7 @@ def cpu_config() -> PointNet2Config:
         far_widths=((64, 64, 128), (64, 64, 128)),
         whole_widths=(128, 256, 512),
         back_widths=((128, 128), (128, 96), (96, 96)),
-        learning=LearningConfig(points=128, dropout=0.0, rotated=0.0, epochs=30, lr=2e-3, batch=32),
+        learning=LEAN,
     )
 
 

@@ -109,10 +109,10 @@ def release(request: ReleaseRequest) -> list[Path]:
     require_fields(header, RUN_FIELDS, request.checkpoint)
     if not header["finished"]:
         raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
-    header = {**header, **frame_of_before(method, header, request)}
+    header = {**header, **frame_of_before(method, header, request),
+              "config": without_folders(header["config"])}  # fmt: skip
     source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
-    public = {**header, "config": without_folders(header["config"])}
-    slim(method, request.out, {**public, "source": sha256_file(source)})
+    slim(method, request.out, {**header, "source": sha256_file(source)})
     card = request.out.with_suffix(".md")
     write_bytes(card, card_of(header, request).encode())
     answers = answers_file(request.out)
@@ -232,7 +232,7 @@ def card_of(header: Header, request: ReleaseRequest) -> str:
         frame=frame_sentence(header),
         labels=", ".join(header["supervision"]) or "none",
         scores=scores_table(header, request.scores),
-        config=json.dumps(without_folders(header["config"]), indent=1, sort_keys=True),
+        config=json.dumps(header["config"], indent=1, sort_keys=True),
     )
 
 
@@ -294,7 +294,7 @@ def _reports(header: Header, scores: Path) -> Iterator[Report]:
             header["method"], header["category"], header["seed"]
         )  # fmt: skip
         if same and report.run.get("data_digest") == header["data_digest"] and (
-            report.run.get("config") == header["config"]
+            without_folders(report.run.get("config", {})) == header["config"]
         ) and "label-order" not in report.variant:  # fmt: skip
             yield report
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Test-time refinement: pose and joints of each cloud moved until the posed template fits it.
+"""The posed template at test time: labels from its nearest points, and each cloud fitted by it.
 
-Not in the paper. Networks stay as they are; per cloud a small rotation, a translation and changes
-of pivot, axis and state are found by Adam on the reconstruction loss of stage 2, and kept where
-they lower it. No label is involved.
+Not in the paper. In refinement networks stay as they are; per cloud a small rotation, a translation
+and changes of pivot, axis and state are found by Adam on the reconstruction loss of stage 2, and
+kept where they lower it. No label is involved.
 """
 
 from __future__ import annotations
