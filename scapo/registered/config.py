@@ -77,6 +77,12 @@ class DiscoveryConfig(TemplateConfig):
     template_points: int = 400
     """Points of the template while it is sought."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError where the dense template would never be built, or the grid is coarse."""
+        TemplateConfig.__post_init__(self)
+        if self.dense_rounds < 1:
+            raise ValueError(f"dense_rounds: expected at least 1, found {self.dense_rounds}")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SearchConfig:

@@ -16,6 +16,11 @@ def test_a_grid_too_coarse_is_refused() -> None:
         DiscoveryConfig(rotations=150)
 
 
+def test_a_dense_template_that_would_never_be_built_is_refused() -> None:
+    with pytest.raises(ValueError, match="dense_rounds: expected at least 1, found 0"):
+        DiscoveryConfig(dense_rounds=0)
+
+
 def test_the_quick_preset_does_less_of_the_same() -> None:
     quick, usual = quick_config(), cpu_config()
     for few, many in (
