@@ -20,6 +20,7 @@ from rich.logging import RichHandler
 
 from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
+from scapo.interrupt import exit_interrupted
 
 DESCRIPTION = (
     "Train, predict, score and tabulate methods of articulated pose estimation "
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(1)
     except KeyboardInterrupt as stop:
         say(errors, f"scapo-bench: {str(stop) or 'interrupted'}")
-        sys.exit(130)
+        exit_interrupted()
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from rich.table import Table
 from bench.figures.pictures import predictions_picture, training_curve
 from bench.grid.command import Program, StepError, run_command
 from scapo import store
+from scapo.interrupt import exit_interrupted
 from scapo.predictor import find, released
 
 RELEASED = "released"
@@ -83,7 +84,7 @@ def main() -> None:
         raise SystemExit(1) from error
     except KeyboardInterrupt:
         console.print("demo: interrupted; run it again to go on from here")
-        raise SystemExit(130) from None
+        exit_interrupted()
     console.print(table)
     console.print(closing_words(demo, time.perf_counter() - started), soft_wrap=True)
 

@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
+from scapo.interrupt import exit_interrupted
 from scapo.text import one_line
 from sim_assets.cli.verbs import VERBS, UsageError
 
@@ -54,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:
         _say(errors, "scapo-data: stopped; the same command takes it up where it was")
-        sys.exit(130)
+        exit_interrupted()
 
 
 def _say(console: Console, line: str) -> None:

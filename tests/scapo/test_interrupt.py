@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""An interrupted program's exit status, wherever the interrupt came."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+# As a module that is run by `python -m`; `exec` of a string is how dataclasses are made.
+PROGRAM = """
+from scapo.interrupt import exit_interrupted
+try:
+    {raised}
+except KeyboardInterrupt:
+    {ended}
+"""
+
+
+@pytest.mark.parametrize("raised", ["raise KeyboardInterrupt", "exec('raise KeyboardInterrupt')"])
+def test_status_of_an_interrupted_module(tmp_path: Path, raised: str) -> None:
+    words = PROGRAM.format(raised=raised, ended="exit_interrupted()")
+    (tmp_path / "interrupted_module.py").write_text(words)
+    ended = subprocess.run(
+        [sys.executable, "-m", "interrupted_module"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.returncode, ended.stderr) == (130, "")
