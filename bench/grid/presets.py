@@ -8,7 +8,7 @@ and, through the budget, the epochs of methods that a preset does not bound.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from bench.requests import Mode
@@ -89,7 +89,11 @@ NETWORKS = (
     Entry(method="op-align", seeds=THREE, rates=(34,), seconds={"fast": 0.018}),
     Entry(method="op-align", name="op-align-isolated", rates=(34,), seconds={"fast": 0.018},
           parts=("isolated",)),
-    Entry(method="scapo", seeds=THREE, rates=(115, 105), seconds={"fast": 0.01}),
+    Entry(method="scapo", seeds=THREE, rates=(115, 105), seconds={"fast": 0.01},
+          parts=("clean", "sensor")),
+    # Searches parts and joints on whole surfaces before its second stage.
+    Entry(method="scapo", name="scapo-complete", preset="complete", seeds=THREE, rates=(115, 105),
+          seconds={"fast": 0.01}, parts=("complete",)),
     Entry(method="scapo", name="scapo-isolated", rates=(115, 105), seconds={"fast": 0.01},
           parts=("isolated",)),
 )  # fmt: skip
@@ -112,10 +116,16 @@ REGISTERED = Entry(
     training=1200,
     seconds={"fast": 0.05, "quick": 0.06, "refine": 0.35},
 )
-WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=REGISTERED,
+OBJECTS = replace(REGISTERED, name="registered-objects", seeds=(1,),
+                  flags=("--supervision", "instance"))  # fmt: skip
+"""Told which training clouds show the same object."""
+BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("refine",),
+              training=300, seconds={"refine": 0.35})  # fmt: skip
+"""What its search can do at best, with a template of true placements."""
+WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=OBJECTS,
              parts=("clean", "sensor"), training=1200, seconds={"fast": 0.01})  # fmt: skip
 """The paper's networks, begun at what template registration says: SCAPO, warm start."""
-GRID = (*NETWORKS, *LABELLED, REGISTERED, WARM, *ABLATIONS)
+GRID = (*NETWORKS, *LABELLED, REGISTERED, OBJECTS, WARM, BOUND, *ABLATIONS)
 
 PRESETS: Mapping[PresetName, Preset] = {
     "smoke": Preset(
