@@ -199,6 +199,8 @@ class AbstractMethod(nn.Module, ABC):
     """A frozen dataclass; stored in checkpoints."""
     category: Category
     supervision: frozenset[Supervision]
+    camera: bool | None = None
+    """Whether training or prediction uses where the camera stands; None: as its registry line."""
     journal: Journal = Journal()
     """Of the `start` that is going on."""
 

@@ -123,7 +123,8 @@ BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("r
               training=300, seconds={"refine": 0.35})  # fmt: skip
 """What its search can do at best, with a template of true placements."""
 WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=OBJECTS,
-             parts=("clean", "sensor"), training=1200, seconds={"fast": 0.01})  # fmt: skip
+             flags=OBJECTS.flags, parts=("clean", "sensor"), training=1200,
+             seconds={"fast": 0.01})  # fmt: skip
 """The paper's networks, begun at what template registration says: SCAPO, warm start."""
 GRID = (*NETWORKS, *LABELLED, REGISTERED, OBJECTS, WARM, BOUND, *ABLATIONS)
 

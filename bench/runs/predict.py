@@ -100,7 +100,7 @@ def _made(
         seed=header["seed"],
         data_digest=split.manifest.digest,
         supervision=tuple(sorted(method.supervision)),
-        camera=None if entry is None else entry.camera,
+        camera=entry.camera if entry is not None and method.camera is None else method.camera,
         budget=budget,
         run={name: header[name] for name in RUN_FIELDS if name in header},
         definition=foreign(method.category),

@@ -50,8 +50,9 @@ class ScapoConfig:
     the posed template, which ends at the hinge where two Gaussians do not."""
     encoder_in_stage_2: Literal["joint", "frozen", "end-to-end"] = "joint"
     """joint: frozen for the first half, then a tenth of the rate; end-to-end: all of it."""
-    supervision: tuple[Literal["segmentation", "joint"], ...] = ()
-    """Labels that training may see: both in Table 2."""
+    supervision: tuple[Literal["segmentation", "joint", "instance"], ...] = ()
+    """Labels that training may see: segmentation and joint in Table 2; instance where the run in
+    `start` was told which clouds show the same object."""
     epochs: tuple[int, ...] = (200, 200)
     """Epochs of each stage; one number for both."""
     lr: tuple[float, float] = (1e-3, 1e-4)

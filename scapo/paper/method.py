@@ -94,6 +94,7 @@ class Scapo(AbstractMethod):
         self.config = config
         self.category = category
         self.supervision = frozenset(config.supervision)
+        self.camera = config.part_start == "run"  # which knows where its cameras stood
         self.least_points = config.encoder.neighbours
         self.kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         parts, code = len(category.parts), config.encoder.code
@@ -114,7 +115,9 @@ class Scapo(AbstractMethod):
         config = self.config
         preset = PRESETS[config.preset]()
         words = [] if config.preset == "paper" else [config.preset]
-        words += ["".join(sorted((label[0].upper() for label in config.supervision), reverse=True))]
+        seen = self.supervision & {"segmentation", "joint"}
+        words += ["".join(sorted((label[0].upper() for label in seen), reverse=True))]
+        words += ["objects known"] if "instance" in self.supervision else []
         words += changes(config, preset, leave=UNNAMED)
         words += [f"wo_{term}" for term in config.loss.without]
         return "-".join(word for word in words if word)
@@ -204,7 +207,14 @@ class Scapo(AbstractMethod):
                     "start: expected the run folder of a trained `registered`, found none; "
                     "`scapo-bench train registered --category C --data DIR --out RUN` makes one"
                 )
-            self._run = WarmStart(load_run(Path(self.config.start), self.category))
+            run = load_run(Path(self.config.start), self.category)
+            hidden = " ".join(sorted(run.supervision - self.supervision))
+            if hidden:  # what the run learned from, this training learns from too
+                raise ValueError(
+                    f"supervision: expected what {self.config.start} was told, {hidden}, "
+                    f"found it left out; add --supervision {hidden}"
+                )
+            self._run = WarmStart(run)
         return self._run
 
     def _searched(self, aligned: Float[Tensor, "B N 3"], medoid: int) -> tuple[Skeleton, Lying]:

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -112,9 +113,12 @@ def placed(category: str = "oven") -> TemplateRegistration:
     return method.eval()
 
 
-def placed_run(folder: Path, category: str = "oven") -> Path:
+def placed_run(
+    folder: Path, category: str = "oven", supervision: tuple[Literal["instance"], ...] = ()
+) -> Path:
     """A run folder with that model."""
-    header = checkpoint_header("registered", CONFIG, category, {"seed": 1, "steps": 0})
+    config = replace(CONFIG, supervision=supervision)
+    header = checkpoint_header("registered", config, category, {"seed": 1, "steps": 0})
     write_checkpoint(folder / WEIGHTS, placed(category), header)
     return folder
 

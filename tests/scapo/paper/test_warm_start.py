@@ -246,6 +246,20 @@ def test_a_start_that_cannot_be_is_refused(run: Path, tmp_path: Path) -> None:
         load_run(run, CATEGORIES["laptop"])
 
 
+def test_what_the_run_was_told_the_warm_start_says_too(tmp_path: Path) -> None:
+    """Rows of tables tell labels and camera by the method's own words."""
+    told, observation = placed_run(tmp_path, supervision=("instance",)), oracle()[1]
+    with pytest.raises(ValueError, match="instance, found it left out; add --supervision instance"):
+        warm(told).start(CANONICALISE, observation, Labels(), generator(1))
+    config = replace(WARM, start=str(told), supervision=("instance",))
+    model = Scapo(config, CATEGORIES["oven"], generator(0))
+    model.start(CANONICALISE, observation, Labels(), generator(1))
+    assert model.supervision == {"instance"}
+    assert model.variant.replace("-objects known", "") == warm(told).variant != model.variant
+    assert model.camera
+    assert not tiny().camera
+
+
 def test_the_preset_leaves_the_base_free_and_takes_partial_clouds() -> None:
     preset = warm_config()
     assert preset.part_start == "run"
