@@ -25,9 +25,9 @@ from tests.helpers.small import FLAGS
 
 PROGRAMS = {"scapo-data": sim_assets.__main__.main, "scapo-bench": bench.__main__.main}
 SMALL = {
-    "generate": ["--backend", "raycast", "--points", "128", "--count", "6", "--workers", "0"],
+    "generate": ["--backend", "raycast", "--points", "128", "--count", "10", "--workers", "0"],
     "check": ["--workers", "0"],
-    "train": [*FLAGS["scapo"][2:], "--no-pictures"],
+    "train": [*FLAGS["registered"], "--no-pictures"],
     "actuate": ["--workers", "0", "--limit", "1"],
     "preview": ["--count", "2"],
     "evaluate": ["--no-companions"],
