@@ -193,6 +193,8 @@ class AbstractMethod(nn.Module, ABC):
     name: ClassVar[str]
     networks: ClassVar[tuple[str, ...]] = ()
     """Submodules whose forward passes may run in reduced precision or compiled (`precision`)."""
+    usual: ClassVar[Mode] = "fast"
+    """The mode in which users are answered who ask for none."""
     least_points: int = 1
     """Points that a cloud needs to be predicted at all."""
     config: Any

@@ -36,7 +36,8 @@ class Predictor:
     >>> config = RegisteredConfig(points=64, width=8)
     >>> # `load` gives a trained one.
     >>> method = TemplateRegistration(config, CATEGORIES["oven"], torch.Generator())
-    >>> found = Predictor(method, "cpu").predict(np.random.default_rng(0).normal(size=(3, 100, 3)))
+    >>> clouds = np.random.default_rng(0).normal(size=(3, 100, 3))
+    >>> found = Predictor(method, "cpu").predict(clouds, "fast")
     >>> found.part_weight.shape, found.joints.axis.shape, found.camera_T_part.shape
     (torch.Size([3, 100, 2]), torch.Size([3, 1, 3]), torch.Size([3, 2, 4, 4]))
     """
@@ -63,7 +64,7 @@ class Predictor:
     def predict(
         self,
         points: np.ndarray | Tensor,
-        mode: Mode = "fast",
+        mode: Mode | None = None,
         sensor: np.ndarray | Tensor | None = None,
         color: np.ndarray | Tensor | None = None,
         *,
@@ -76,7 +77,8 @@ class Predictor:
 
         Args:
             points: (..., N, 3), camera frame, metres, numpy or torch.
-            mode: `fast`, networks only, or `refine`.
+            mode: `fast`, networks only, `quick` or `refine`; by default the method's own choice,
+                `quick` for template registration, whose network alone says little.
             sensor: (..., 3), centre of the camera, metres, for clouds in another frame than the
                 camera's. What `refine` of a `registered` model uses.
             color: (..., N, 3), in [0, 1], for methods that look at it.
@@ -90,6 +92,7 @@ class Predictor:
             ValueError: Another shape, no cloud, fewer points than the method needs, values that
                 are not finite, another mode.
         """
+        mode = self.model.usual if mode is None else mode
         if mode not in get_args(Mode):
             raise ValueError(f"mode: expected one of {', '.join(get_args(Mode))}, found {mode!r}")
         cloud, least = self._tensor(points), self.model.least_points

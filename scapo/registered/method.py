@@ -106,6 +106,7 @@ class AbstractRegistered(AbstractMethod):
     """
 
     networks: ClassVar[tuple[str, ...]] = ("network",)
+    usual: ClassVar[Mode] = "quick"
     least_points = NEIGHBOURS
 
     def __init__(

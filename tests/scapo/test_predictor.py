@@ -13,13 +13,14 @@ from torch.testing import assert_close
 
 from scapo.alignment import unit_length
 from scapo.categories import CATEGORIES
+from scapo.paper.method import Scapo
 from scapo.predictor import Predictor, load, released
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
 from scapo.registry import LIBRARY
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, with_alignment, write_checkpoint
 from scapo.store.schema import StoreError
-from scapo.types import Observation
+from scapo.types import Observation, Prediction
 from tests.helpers.conventions import convention
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator
@@ -103,17 +104,33 @@ def test_the_registered_variant_loads_too(tmp_path: Path) -> None:
     )
     points = plates(2, 96)[0].points
     wanted = model.predict(Observation(points=points))
-    found = load(tmp_path).predict(points, sensor=np.zeros(3))
+    found = load(tmp_path).predict(points, "fast", sensor=np.zeros(3))
     assert_close(found.part_weight, wanted.part_weight)
     assert_close(found.camera_T_part, wanted.camera_T_part)
-    one = load(tmp_path).predict(points[0].double().numpy())
+    one = load(tmp_path).predict(points[0].double().numpy(), "fast")
     assert_close(one.part_weight, wanted.part_weight[0])
     assert found.confidence is not None
     assert_close(one.confidence, found.confidence[0])
-    few = load(tmp_path).predict(points[:, :40])
+    few = load(tmp_path).predict(points[:, :40], "fast")
     assert few.part_weight.shape == (2, 40, 2)
     with pytest.raises(ValueError, match="at least one cloud, found"):
         load(tmp_path).predict(np.zeros((0, 96, 3)))
+
+
+@pytest.mark.parametrize(("name", "usual"), [("scapo", "fast"), ("registered", "quick")])
+def test_who_asks_for_no_mode_gets_the_usual_one(monkeypatch, name: str, usual: str) -> None:
+    kind = {"scapo": Scapo, "registered": TemplateRegistration}[name]
+    config = {"scapo": TINY, "registered": RegisteredConfig(points=64, width=8)}[name]
+    model, asked = kind(config, CATEGORIES["laptop"], generator(0)), list[str]()
+
+    def predict(observation: Observation, mode: str) -> Prediction:
+        asked.append(mode)
+        return Prediction(part_weight=torch.ones(len(observation.points), 96, 2) / 2)
+
+    monkeypatch.setattr(model, "predict", predict)
+    Predictor(model, "cpu").predict(plates(2, 96)[0].points)
+    Predictor(model, "cpu").predict(plates(2, 96)[0].points, "refine")
+    assert asked == [usual, "refine"]
 
 
 def test_a_misspelt_category_is_told_the_one_that_looks_like_it(monkeypatch) -> None:
