@@ -35,6 +35,8 @@ MAX_DOWNLOAD = 20 * 1024 * 1024
 """Bytes of a file that the page carries; larger ones are named."""
 SEEN = (0.02, 0.98)
 """Quantiles of the coordinates that count as the object's ends."""
+DIGEST = 12
+"""Characters of the checkpoint's digest that are shown."""
 AXIS = 0.55
 """Half the length of a drawn axis, in radii of the object."""
 
@@ -74,9 +76,9 @@ def _text(name: str) -> str:
 
 
 def _lead(twin: Twin) -> str:
-    model = ", ".join(f"{name} {text}" for name, text in twin.model.items())
     points = f"{len(twin.points):,} observed points"
-    return f"{points}; {model}" if model else points
+    model = ", ".join(f"{name} {text[:DIGEST]}" for name, text in twin.model.items())
+    return f"{points}; model: {model}" if model else points
 
 
 def _warnings(twin: Twin, made: Articulated) -> str:
@@ -140,7 +142,8 @@ def _numbers(twin: Twin) -> str:
     text += _table("Parts.", ["part", "points", "confidence of the rotation"], parts)
     if twin.evidence:
         rows = [[name, f"{value:.4g}"] for name, value in sorted(twin.evidence.items())]
-        text += _table("What the confidences are made of.", ["evidence", "value"], rows)
+        words = "What the confidences are made of: losses of the view, 0 to 3, and spreads in degrees."
+        text += _table(words, ["evidence", "value"], rows)
     return text
 
 
