@@ -142,7 +142,7 @@ def _numbers(twin: Twin) -> str:
     text += _table("Parts.", ["part", "points", "confidence of the rotation"], parts)
     if twin.evidence:
         rows = [[name, f"{value:.4g}"] for name, value in sorted(twin.evidence.items())]
-        words = "What the confidences are made of: losses of the view, 0 to 3, and spreads in degrees."
+        words = "What they are made of: losses of the view, 0 to about 3, and spreads in degrees."
         text += _table(words, ["evidence", "value"], rows)
     return text
 
