@@ -2,8 +2,8 @@
 """Predictions files: the header, the tensors, and the refusal of what is not one.
 
 One safetensors file, written by any program (docs/bring-your-own-method.md). Every complaint is
-one line: `file: tensor: expected, found`. A sample whose whole row of a tensor is NaN has no
-answer there: it is counted and its scores are empty.
+one line: `file: tensor: expected, found`. A sample whose whole row of a tensor is NaN has no answer
+there, nor has a part or joint with a NaN among its own numbers: scores are empty and counted.
 """
 
 from __future__ import annotations
@@ -299,23 +299,26 @@ class Predictions:
         return out
 
     def finish(self) -> None:
-        """After the last block: refuse a tensor in which no sample has an answer.
+        """After the last block: refuse a file that answers nothing at all.
 
         Raises:
-            StoreError: Naming the tensor.
+            StoreError: No tensor has an answer for any sample; a confidence is none.
         """
-        for name, missing in self.unanswered.items():
-            if self._count and missing == self._count:
-                raise StoreError(
-                    f"{self.path}: tensor {name!r}: expected an answer for at least "
-                    f"one of {self._count} samples, found NaN in all"
-                )
+        missing = [n for name, n in self.unanswered.items() if not name.startswith(CONFIDENCE)]
+        if self._count and all(n == self._count for n in missing):
+            raise StoreError(
+                f"{self.path}: expected an answer for at least one of {self._count} samples, "
+                f"found none in {', '.join(self.names)}"
+            )
 
 
 _FLOAT = ("F32",)
 _HALF_OR_FLOAT = ("F16", "F32")
 _NUMBER = ("F16", "F32", "F64")
 
+CONFIDENCE = "confidence_"
+SLOTTED = ("camera_T_part", "joint_pivot", "joint_axis", "joint_state")
+"""Tensors of parts or joints, each of which may lack its answer alone."""
 MAX_VALUES = 1 << 18
 """Of a tensor's row: a sparse file may say that it holds terabytes."""
 ROTATION_TOLERANCE = 1e-3
@@ -348,7 +351,7 @@ def check_tensors(where: str, file: Any, split: Split) -> dict[str, Any]:  # noq
     for name in file.keys():  # noqa: SIM118 - an open file, not a dict
         item = file.get_slice(name)
         expected = layout.get(name)
-        if expected is None and name.startswith("confidence_"):
+        if expected is None and name.startswith(CONFIDENCE):
             expected = (_HALF_OR_FLOAT, (count, *item.get_shape()[1:]))
         if expected is None:
             raise StoreError(
@@ -396,6 +399,8 @@ def check_rows(
 ) -> tuple[np.ndarray, int]:
     """A block of one tensor after checking its values, and how many samples have no answer.
 
+    A part or joint with a NaN among its numbers comes back as NaN alone: half an answer is none.
+
     Args:
         where: File and tensor, for the message.
         name: Of the tensor.
@@ -408,22 +413,26 @@ def check_rows(
     """
     if name == "part":
         return _check_labels(where, array, first, parts)
-    flat = array.reshape(len(array), -1)
-    missing = np.isnan(flat).all(1)
-    finite = np.isfinite(flat).all(1)
+    alone = name in SLOTTED or (name.startswith(CONFIDENCE) and array.ndim > 1)
+    slots = array.reshape(len(array), array.shape[1] if alone else 1, -1)
     _refuse(
-        np.asarray(~(finite | missing)),
+        np.asarray(np.isinf(slots).any((1, 2))),
         where,
         first,
-        "finite values or a row of NaN alone",
-        lambda i: "some NaN" if np.isnan(flat[i]).any() else "an infinite value",
+        "finite values or NaN",
+        lambda i: "an infinite value",
     )
-    known = np.flatnonzero(finite)
+    lost = np.isnan(slots)
+    none, some = lost.all(2), lost.any(2)
+    if not alone:
+        _refuse((some & ~none).any(1), where, first, "a row of NaN or none", lambda i: "some NaN")
+    if (some & ~none).any():
+        array = np.where(some[..., None], array.dtype.type(np.nan), slots).reshape(array.shape)
     if name == "part_weight":
-        _check_weights(where, array, known, first)
+        _check_weights(where, array, np.flatnonzero(~some[:, 0]), first)
     if name == "camera_T_part":
-        _check_poses(where, array, known, first)
-    return array, int(missing.sum())
+        _check_poses(where, array, ~some, first)
+    return array, int(some.all(1).sum())
 
 
 def _refuse(
@@ -477,9 +486,10 @@ def _check_weights(where: str, array: np.ndarray, known: np.ndarray, first: int)
     )
 
 
-def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
-    worst = np.zeros(len(array))
-    worst[known] = rotation_error(array[known][..., :3, :3]).max(1)
+def _check_poses(where: str, array: np.ndarray, known: Bool[np.ndarray, "B P"], first: int) -> None:
+    worst = np.zeros(known.shape)
+    worst[known] = rotation_error(array[known][:, :3, :3])
+    worst = worst.max(1)
     _refuse(
         worst > ROTATION_TOLERANCE,
         where,
@@ -487,8 +497,9 @@ def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -
         f"rotations with R R^T = I within {ROTATION_TOLERANCE} and det R = 1",
         lambda i: f"an error of {worst[i]:.4g}" if worst[i] != 2 else "a reflection",
     )
-    last = np.zeros(len(array))
-    last[known] = np.abs(array[known][..., 3, :] - np.array([0, 0, 0, 1])).max((-1, -2))
+    last = np.zeros(known.shape)
+    last[known] = np.abs(array[known][:, 3, :] - np.array([0, 0, 0, 1])).max(-1)
+    last = last.max(1)
     _refuse(
         last > ROTATION_TOLERANCE,
         where,
