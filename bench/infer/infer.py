@@ -14,7 +14,7 @@ from bench.infer.cloud import Cloud, InputError
 from bench.infer.files import Choice, Result, write_result
 from bench.infer.model import Model, load_models
 from bench.infer.readers import ReadOptions, find_inputs, read_input
-from bench.requests import InferRequest, Mode
+from bench.requests import InferRequest, Mode, require_some
 from bench.runs.train import pick_device
 from scapo.text import is_word, one_line
 
@@ -42,15 +42,17 @@ def infer(request: InferRequest, tell: Callable[[Done], None]) -> list[Done]:
 
     Raises:
         StoreError: No model.
-        InputError: No inputs, or two of one name.
+        UsageError: No inputs.
+        InputError: None that can be read, two of one name, or a scale or place that cannot be.
     """
+    require_some("INPUT", request.inputs)
+    options = ReadOptions(
+        scale=request.scale, intrinsics=request.intrinsics, mask=request.mask, sensor=request.sensor
+    )
     inputs = find_inputs(request.inputs)
     folders = [request.out / name for name in distinct_names(inputs)]
     device = pick_device(request.device)
     models = load_models(request.checkpoint, request.category, device, request.mode)
-    options = ReadOptions(
-        scale=request.scale, intrinsics=request.intrinsics, mask=request.mask, sensor=request.sensor
-    )
     done = []
     for path, folder in zip(inputs, folders, strict=True):
         done.append(_one(path, folder, models, options, request))

@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ HEADER = 1 << 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
-    """What a file does not say itself."""
+    """What a file does not say itself; `scale` above 0 and `sensor` finite, else an InputError."""
 
     scale: float | None = None
     """Metres in the unit of the input."""
@@ -37,6 +38,14 @@ class ReadOptions:
     """Of a depth image: which pixels show the object."""
     sensor: tuple[float, float, float] | None = None
     """Centre of the camera in the cloud's frame, metres."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no unit and no place can be."""
+        if self.scale is not None and not (isfinite(self.scale) and self.scale > 0):
+            raise InputError(f"--scale: expected a finite number above 0, found {self.scale:g}")
+        if self.sensor is not None and not all(map(isfinite, self.sensor)):
+            found = " ".join(f"{value:g}" for value in self.sensor)
+            raise InputError(f"--sensor: expected 3 finite numbers, found {found}")
 
 
 def find_inputs(paths: Sequence[Path]) -> list[Path]:

@@ -83,6 +83,21 @@ def test_a_single_failure_is_one_line(data, message, run, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", ["a.npz", "a.png"])
+def test_a_scale_of_zero_is_refused_for_clouds_and_images(name, run, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert call("infer", tmp_path / name, "--run", run, "--out", out, "--scale", "0") == 1
+    assert "--scale: expected a finite number above 0, found 0" in capsys.readouterr().err
+
+
+def test_no_input_is_wrong_usage(tmp_path, capsys):
+    assert call("infer", "--out", tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert said == "scapo-bench: INPUT: expected one or more, found none\n"
+    assert call("infer", "--help") == 0
+    assert "(default: )" not in capsys.readouterr().out
+
+
 def test_a_missing_model_is_said_before_anything_is_read(tmp_path, capsys):
     assert call("infer", "none.ply", "--run", tmp_path / "no", "--out", tmp_path / "out") == 1
     assert "expected a run folder" in capsys.readouterr().err

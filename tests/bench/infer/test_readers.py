@@ -118,6 +118,18 @@ def test_what_is_broken_is_named(name, tmp_path):
     assert str(path) in str(refused.value)
 
 
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+def test_a_scale_that_no_unit_has_is_refused(scale):
+    with pytest.raises(InputError, match="--scale: expected a finite number above 0, found"):
+        ReadOptions(scale=scale)
+
+
+@pytest.mark.parametrize("place", [(0.0, np.nan, 1.0), (np.inf, 0.0, 0.0)])
+def test_a_camera_stands_somewhere(place):
+    with pytest.raises(InputError, match="--sensor: expected 3 finite numbers, found"):
+        ReadOptions(sensor=place)
+
+
 def test_flags_of_depth_images_are_refused_for_clouds(tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(FILES["a.ply"])
