@@ -9,7 +9,7 @@ from math import degrees
 from pathlib import Path
 
 from bench.infer.answer import agreement, ask
-from bench.infer.calibration import with_confidence
+from bench.infer.calibration import JOINT_DEGREES, with_confidence
 from bench.infer.cloud import Cloud, InputError
 from bench.infer.files import Choice, Result, write_result
 from bench.infer.model import Model, load_models
@@ -146,9 +146,14 @@ def summary(done: Done) -> str:
         category += f" by {choice.margin:.2f}"
     joints = []
     for j, spec in enumerate(twin.category.joints):
-        known = twin.joint_confidence
-        sure = "" if known is None else f", {100 * float(known[j]):.0f} % sure"
-        joints.append(f"{twin.category.parts[spec.child]} {_state(spec.kind, twin.state[j])}{sure}")
+        known, state = twin.joint_confidence, _state(spec.kind, twin.state[j])
+        # Of the axis alone: nobody calibrated how true states are.
+        sure = "" if known is None else (
+            f" (axis {100 * float(known[j]):.0f} % sure within {JOINT_DEGREES:g} degrees)"
+        )  # fmt: skip
+        # A model with zeros of its own knows no closed state.
+        how = "open " if done.result.aligned else ""
+        joints.append(f"{twin.category.parts[spec.child]} {how}{state}{sure}")
     more = f"; {len(twin.warnings)} warning(s) in joints.json" if twin.warnings else ""
     return f"{done.source}: {category}, {', '.join(joints)}: {done.folder}{more}"
 
