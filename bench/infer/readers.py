@@ -139,10 +139,11 @@ def _read_npz(
 ) -> tuple[Num[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None, np.ndarray | None]:
     try:
         with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
             arrays = {
                 name: _array(path, archive, name)
                 for name in ("points", "color", "sensor")
-                if f"{name}.npy" in archive.namelist()
+                if name in names
             }
     except (zipfile.BadZipFile, EOFError, ValueError, OSError, RuntimeError) as error:
         if isinstance(error, InputError):
@@ -150,7 +151,8 @@ def _read_npz(
         raise InputError(f"{path}: expected a readable .npz file, found {error}") from error
     points, color, sensor = (arrays.get(name) for name in ("points", "color", "sensor"))
     if points is None or points.ndim != 2 or points.shape[1] != 3:
-        found = "none" if points is None else f"one of shape {points.shape}"
+        there = ", ".join(names[:9]) or "none"
+        found = there if points is None else f"one of shape {points.shape}"
         raise InputError(f"{path}: expected an array points of shape (N, 3), found {found}")
     if color is not None and color.shape != points.shape:
         raise InputError(f"{path}: color: expected shape {points.shape}, found {color.shape}")
