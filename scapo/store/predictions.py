@@ -415,24 +415,20 @@ def check_rows(
         return _check_labels(where, array, first, parts)
     alone = name in SLOTTED or (name.startswith(CONFIDENCE) and array.ndim > 1)
     slots = array.reshape(len(array), array.shape[1] if alone else 1, -1)
-    _refuse(
-        np.asarray(np.isinf(slots).any((1, 2))),
-        where,
-        first,
-        "finite values or NaN",
-        lambda i: "an infinite value",
-    )
+    infinite = np.asarray(np.isinf(slots).any((1, 2)))
+    _refuse(infinite, where, first, "finite values or NaN", lambda i: "an infinite value")
     lost = np.isnan(slots)
-    none, some = lost.all(2), lost.any(2)
+    some = np.asarray(lost.any(2))
+    half = some & ~np.asarray(lost.all(2))
     if not alone:
-        _refuse((some & ~none).any(1), where, first, "a row of NaN or none", lambda i: "some NaN")
-    if (some & ~none).any():
+        _refuse(half[:, 0], where, first, "a row of NaN or none", lambda i: "some NaN")
+    if half.any():
         array = np.where(some[..., None], array.dtype.type(np.nan), slots).reshape(array.shape)
     if name == "part_weight":
         _check_weights(where, array, np.flatnonzero(~some[:, 0]), first)
     if name == "camera_T_part":
         _check_poses(where, array, ~some, first)
-    return array, int(some.all(1).sum())
+    return array, int(np.asarray(some.all(1)).sum())
 
 
 def _refuse(
@@ -477,16 +473,11 @@ def _check_weights(where: str, array: np.ndarray, known: np.ndarray, first: int)
     _refuse(wrong, where, first, "weights of 0 or more", lambda i: f"{lowest[i]:.4g}")
     error = np.abs(total - np.float32(1)).max(1)
     wrong[known] = error[known] > tolerance
-    _refuse(
-        wrong,
-        where,
-        first,
-        f"weights of a point to sum to 1 within {tolerance}",
-        lambda i: f"an error of {error[i]:.4g}",
-    )
+    expected = f"weights of a point to sum to 1 within {tolerance}"
+    _refuse(wrong, where, first, expected, lambda i: f"an error of {error[i]:.4g}")
 
 
-def _check_poses(where: str, array: np.ndarray, known: Bool[np.ndarray, "B P"], first: int) -> None:
+def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
     worst = np.zeros(known.shape)
     worst[known] = rotation_error(array[known][:, :3, :3])
     worst = worst.max(1)
