@@ -176,8 +176,10 @@ def test_an_infinite_weight_is_no_answer_of_its_point(iou):
     weight[0, 0] = np.inf
     labels = case["part_true"].copy()
     labels[0, 0] = -1
-    with_labels = sample_errors(**case | {"part_pred": labels})["iou"]
-    found = sample_errors(**case | {"part_pred": weight}, iou=iou)["iou"]
+    case["part_pred"] = labels
+    with_labels = sample_errors(**case)["iou"]
+    case["part_pred"] = weight
+    found = sample_errors(**case, iou=iou)["iou"]
     np.testing.assert_allclose(found, with_labels)
     assert found[0].min() < 1
     np.testing.assert_array_equal(found[1:], 1)
