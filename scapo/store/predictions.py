@@ -248,7 +248,8 @@ class Predictions:
         self.header = read_prediction_header(path)
         check_belongs(path, self.header, split.manifest)
         self.unanswered: dict[str, int] = {}
-        """Samples without an answer so far, by tensor."""
+        """Samples without an answer, or without one of a part or joint, so far, by tensor."""
+        self._answered = False
         self._count = split.manifest.count
         self._parts = len(split.manifest.parts)
         frame = self.header.object_frame
@@ -295,7 +296,11 @@ class Predictions:
                 ) from error
             where = f"{self.path}: tensor {name!r}"
             out[name], missing = check_rows(where, name, array, first, self._parts)
+            if name.startswith(CONFIDENCE):  # no answer
+                continue
             self.unanswered[name] = self.unanswered.get(name, 0) + missing
+            known = out[name] >= 0 if name == "part" else ~np.isnan(out[name])
+            self._answered |= bool(known.any())
         return out
 
     def finish(self) -> None:
@@ -304,8 +309,7 @@ class Predictions:
         Raises:
             StoreError: No tensor has an answer for any sample; a confidence is none.
         """
-        missing = [n for name, n in self.unanswered.items() if not name.startswith(CONFIDENCE)]
-        if self._count and all(n == self._count for n in missing):
+        if self._count and not self._answered:
             raise StoreError(
                 f"{self.path}: expected an answer for at least one of {self._count} samples, "
                 f"found none in {', '.join(self.names)}"
@@ -397,7 +401,7 @@ def _check_tensor(
 def check_rows(
     where: str, name: str, array: np.ndarray, first: int, parts: int
 ) -> tuple[np.ndarray, int]:
-    """A block of one tensor after checking its values, and how many samples have no answer.
+    """A block of one tensor after checking its values, and how many samples lack an answer.
 
     A part or joint with a NaN among its numbers comes back as NaN alone: half an answer is none.
 
@@ -428,7 +432,7 @@ def check_rows(
         _check_weights(where, array, np.flatnonzero(~some[:, 0]), first)
     if name == "camera_T_part":
         _check_poses(where, array, ~some, first)
-    return array, int(np.asarray(some.all(1)).sum())
+    return array, int(np.asarray(some.any(1)).sum())
 
 
 def _refuse(
@@ -491,10 +495,5 @@ def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -
     last = np.zeros(known.shape)
     last[known] = np.abs(array[known][:, 3, :] - np.array([0, 0, 0, 1])).max(-1)
     last = last.max(1)
-    _refuse(
-        last > ROTATION_TOLERANCE,
-        where,
-        first,
-        "a last row 0 0 0 1",
-        lambda i: f"an error of {last[i]:.4g}",
-    )
+    wrong = np.asarray(last > ROTATION_TOLERANCE)
+    _refuse(wrong, where, first, "a last row 0 0 0 1", lambda i: f"an error of {last[i]:.4g}")

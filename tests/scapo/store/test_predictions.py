@@ -130,7 +130,8 @@ def test_a_missing_slot_costs_its_own_scores_alone(name, place, split, tmp_path)
     lost = LOST[name, place]
     assert {key: n for key, n in undefined.items() if not key.endswith("_r4")} == lost
     assert all(summary[key]["mean"] < 0.1 for key in lost)
-    assert not any(report["counts"]["unanswered"].values())  # each sample answered something
+    # A table tells of such samples: who leaves out what is hard has the better mean.
+    assert report["counts"]["unanswered"] == dict.fromkeys(sorted(arrays), 0) | {name: 1}
     kind = "part" if name == "camera_T_part" else "joint"
     assert precision[f"{kind}_15"]["k"] == (7 if name == "joint_state" else 6)
     with gzip.open(request.out, "rt") as file:
@@ -165,7 +166,7 @@ def test_half_a_slot_comes_back_as_none():
     found, missing = check_rows("here", "camera_T_part", poses, 0, 3)
     assert np.isnan(found[1, 2]).all()
     assert np.isfinite(found[1, :2]).all()
-    assert missing == 0
+    assert missing == 1
 
 
 @pytest.mark.parametrize("key", ["data_digest", "digest", "data"])
