@@ -20,6 +20,7 @@ from rich.logging import RichHandler
 
 from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
+from bench.requests import UsageError
 from scapo.interrupt import exit_interrupted
 
 DESCRIPTION = (
@@ -61,6 +62,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except MemoryError as error:
         say(errors, f"scapo-bench: expected enough memory, found: {error}")
         sys.exit(1)
+    except UsageError as error:
+        say(errors, f"scapo-bench: {error}")
+        sys.exit(2)
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         say(errors, f"scapo-bench: {error}")
         sys.exit(1)

@@ -8,7 +8,7 @@ be computed is NaN, never perfect. Angles are degrees, lengths those of the inpu
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num
@@ -101,11 +101,15 @@ def sample_errors(  # noqa: PLR0913
     Returns:
         `order` (B, P), `iou` (B, P), `joint_direction` (B, J), `joint_pivot` (B, J),
         `part_rotation` (B, P), `part_translation` (B, P); slot = predicted slot.
+
+    Raises:
+        ValueError: `label_order`, `iou`, `pivot` or `rotation` that is none of the known ones.
     """
+    check_readings(label_order=label_order, iou=iou, pivot=pivot, rotation=rotation)
     parts = camera_T_part_true.shape[1]
-    agreement = agree(
-        np.asarray(part_true), np.asarray(part_pred), parts, label_order=label_order, iou=iou
-    )
+    said = np.asarray(part_pred)
+    said = finite_or_nan(said) if said.ndim == 3 else said
+    agreement = agree(np.asarray(part_true), said, parts, label_order=label_order, iou=iou)
     poses = reorder_poses(np.asarray(camera_T_part_true), agreement.order, symmetry)
     turn, shift = pose_errors(poses, camera_T_part_pred, rotation)
     direction, distance = joint_errors(
@@ -123,6 +127,21 @@ def sample_errors(  # noqa: PLR0913
         "part_rotation": turn,
         "part_translation": shift,
     }
+
+
+KINDS = {"label_order": LabelOrder, "iou": IouKind, "pivot": PivotKind, "rotation": RotationKind}
+
+
+def check_readings(**readings: str) -> None:
+    """Refuse what is no reading of the metrics, by the names of `sample_errors`.
+
+    Raises:
+        ValueError: Naming the known ones.
+    """
+    for name, found in readings.items():
+        known = get_args(KINDS[name])
+        if found not in known:
+            raise ValueError(f"{name}: expected one of {', '.join(known)}, found {found!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,7 +197,7 @@ def pose_errors(
     if pred is None:
         nothing = np.full(true.shape[:2], np.nan)
         return nothing, nothing.copy()
-    pred = np.asarray(pred, np.float64)
+    pred = finite_or_nan(pred)
     shift = np.linalg.norm(true[..., :3, 3] - pred[..., :3, 3], axis=-1)
     matrix = pred[..., :3, :3]
     finite = np.asarray(np.isfinite(matrix).all((-2, -1)))
@@ -202,11 +221,11 @@ def joint_errors(
     """Angle between the undirected axes in degrees, and distance of the pivot."""
     nothing = np.full(pivot_true.shape[:2], np.nan)
     true = unit(axis_true)
-    pred = None if axis_pred is None else unit(np.asarray(axis_pred, np.float64))
+    pred = None if axis_pred is None else unit(finite_or_nan(axis_pred))
     direction = nothing if pred is None else line_degrees(true, pred)
     if pivot_pred is None or (kind == "line-line" and pred is None):
         return direction, nothing.copy()
-    offset = np.asarray(pivot_pred, np.float64) - pivot_true
+    offset = finite_or_nan(pivot_pred) - pivot_true
     distance = np.linalg.norm(np.cross(offset, true), axis=-1)
     if kind == "line-line" and pred is not None:
         normal = np.cross(true, pred)
@@ -215,6 +234,12 @@ def joint_errors(
         distance = np.where(sine > PARALLEL, between, distance)
         distance = np.where(np.isfinite(sine), distance, np.nan)
     return direction, distance
+
+
+def finite_or_nan(values: np.ndarray) -> np.ndarray:
+    """As float64, NaN in place of what is infinite: no answer is so far off."""
+    values = np.asarray(values, np.float64)
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def unit(axis: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:

@@ -8,9 +8,10 @@ one of these.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
 
@@ -27,6 +28,25 @@ Kind = Literal["constant", "oracle-pose"]
 """The answers of `reference`."""
 
 M = TypeVar("M")
+
+
+class UsageError(ValueError):
+    """Words of a command that ask for nothing: it ends 2, as a parser's refusal does."""
+
+
+def _some(name: str) -> Any:  # noqa: ANN401 - tyro does not name its type
+    """One or more words; the parser takes none as well, which `require_some` refuses."""
+    return tyro.conf.arg(metavar=f"{name}...", help_behavior_hint="(required)")
+
+
+def require_some(name: str, found: Sequence[Path]) -> None:
+    """Refuse a verb without what it is about.
+
+    Raises:
+        UsageError: Naming it.
+    """
+    if not found:
+        raise UsageError(f"{name}: expected one or more, found none")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,6 +143,8 @@ class RunRequest:
 class PredictRequest(RunRequest):
     """What to predict, and how."""
 
+    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, checkpoint file, or category with a released model."""
     out: Path
     """Predictions file, NAME.safetensors."""
     split: str = "test"
@@ -192,7 +214,7 @@ class PicturesRequest(RunRequest):
 class StudyRequest:
     """Which runs are studied, and on what."""
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN...")]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, _some("RUN")]
     """Run folders, of any methods and categories."""
     data: Path
     """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
@@ -315,7 +337,7 @@ class ModelRequest:
 class InferRequest(ModelRequest):
     """Somebody's files, and what they do not say themselves."""
 
-    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="INPUT...")]
+    inputs: Annotated[tuple[Path, ...], tyro.conf.Positional, _some("INPUT")]
     """Clouds (.ply, .pcd, .npz with points [, color, sensor]), depth images (.png, .tif) and
     folders of these."""
     out: Path

@@ -101,6 +101,10 @@ def _pixels(path: Path, what: str) -> np.ndarray:
     """
     from PIL import Image, UnidentifiedImageError
 
+    if not path.is_file():
+        raise InputError(
+            f"{path}: expected {what}, found {'a folder' if path.is_dir() else 'none'}"
+        )
     try:
         with Image.open(path, formats=("PNG", "TIFF")) as image:
             if image.width * image.height > MOST_PIXELS:
@@ -108,7 +112,7 @@ def _pixels(path: Path, what: str) -> np.ndarray:
                 raise InputError(f"{path}: expected at most {MOST_PIXELS:,} pixels, found {size}")
             values = np.asarray(image)
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
-        if isinstance(error, InputError | FileNotFoundError):
+        if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: expected {what}, found {error}") from error
     except Image.DecompressionBombError as error:
@@ -195,7 +199,7 @@ def _from_file(path: Path) -> tuple[float, ...]:
     try:
         record = yaml.safe_load(path.read_text(encoding="utf-8")[: 1 << 20])
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON or YAML, found {error}") from error
+        raise InputError(f"{path}: expected JSON or YAML, found {_problem(error)}") from error
     named = cast("Mapping[str, Any]", record) if isinstance(record, Mapping) else {}
     for name in MATRICES:
         if name not in named:
@@ -208,9 +212,20 @@ def _from_file(path: Path) -> tuple[float, ...]:
     names = [("fx",), ("fy",), ("cx", "ppx"), ("cy", "ppy")]
     values = [next((named[n] for n in options if n in named), None) for options in names]
     if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
-        found = f"{list(named)[:9]}" if None in values else f"the values {values}"
+        whole = all(any(n in named for n in options) for options in names)
+        found = f"the values {values}" if whole else f"{list(named)[:9]}"
         raise InputError(f"{path}: expected a matrix K or numbers fx, fy, cx, cy, found {found}")
     return tuple(float(cast("float", value)) for value in values)
+
+
+def _problem(error: Exception) -> str:
+    """What a parser says, in a line: of YAML the problem and its place, without the text around."""
+    from yaml import MarkedYAMLError
+
+    if not isinstance(error, MarkedYAMLError) or error.problem_mark is None:
+        return str(error)
+    mark = error.problem_mark
+    return f"{error.problem} in line {mark.line + 1}, column {mark.column + 1}"
 
 
 def _matrix(value: object) -> np.ndarray | None:

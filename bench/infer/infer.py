@@ -9,12 +9,12 @@ from math import degrees
 from pathlib import Path
 
 from bench.infer.answer import agreement, ask
-from bench.infer.calibration import with_confidence
+from bench.infer.calibration import JOINT_DEGREES, with_confidence
 from bench.infer.cloud import Cloud, InputError
 from bench.infer.files import Choice, Result, write_result
 from bench.infer.model import Model, load_models
 from bench.infer.readers import ReadOptions, find_inputs, read_input
-from bench.requests import InferRequest, Mode
+from bench.requests import InferRequest, Mode, require_some
 from bench.runs.train import pick_device
 from scapo.text import is_word, one_line
 
@@ -42,15 +42,17 @@ def infer(request: InferRequest, tell: Callable[[Done], None]) -> list[Done]:
 
     Raises:
         StoreError: No model.
-        InputError: No inputs, or two of one name.
+        UsageError: No inputs.
+        InputError: None that can be read, two of one name, or a scale or place that cannot be.
     """
+    require_some("INPUT", request.inputs)
+    options = ReadOptions(
+        scale=request.scale, intrinsics=request.intrinsics, mask=request.mask, sensor=request.sensor
+    )
     inputs = find_inputs(request.inputs)
     folders = [request.out / name for name in distinct_names(inputs)]
     device = pick_device(request.device)
     models = load_models(request.checkpoint, request.category, device, request.mode)
-    options = ReadOptions(
-        scale=request.scale, intrinsics=request.intrinsics, mask=request.mask, sensor=request.sensor
-    )
     done = []
     for path, folder in zip(inputs, folders, strict=True):
         done.append(_one(path, folder, models, options, request))
@@ -144,9 +146,14 @@ def summary(done: Done) -> str:
         category += f" by {choice.margin:.2f}"
     joints = []
     for j, spec in enumerate(twin.category.joints):
-        known = twin.joint_confidence
-        sure = "" if known is None else f", {100 * float(known[j]):.0f} % sure"
-        joints.append(f"{twin.category.parts[spec.child]} {_state(spec.kind, twin.state[j])}{sure}")
+        known, state = twin.joint_confidence, _state(spec.kind, twin.state[j])
+        # Of the axis alone: nobody calibrated how true states are.
+        sure = "" if known is None else (
+            f" (axis {100 * float(known[j]):.0f} % sure within {JOINT_DEGREES:g} degrees)"
+        )  # fmt: skip
+        # A model with zeros of its own knows no closed state.
+        how = "open " if done.result.aligned else ""
+        joints.append(f"{twin.category.parts[spec.child]} {how}{state}{sure}")
     more = f"; {len(twin.warnings)} warning(s) in joints.json" if twin.warnings else ""
     return f"{done.source}: {category}, {', '.join(joints)}: {done.folder}{more}"
 

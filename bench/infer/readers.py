@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ HEADER = 1 << 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
-    """What a file does not say itself."""
+    """What a file does not say itself; `scale` above 0 and `sensor` finite, else an InputError."""
 
     scale: float | None = None
     """Metres in the unit of the input."""
@@ -37,6 +38,14 @@ class ReadOptions:
     """Of a depth image: which pixels show the object."""
     sensor: tuple[float, float, float] | None = None
     """Centre of the camera in the cloud's frame, metres."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that no unit and no place can be."""
+        if self.scale is not None and not (isfinite(self.scale) and self.scale > 0):
+            raise InputError(f"--scale: expected a finite number above 0, found {self.scale:g}")
+        if self.sensor is not None and not all(map(isfinite, self.sensor)):
+            found = " ".join(f"{value:g}" for value in self.sensor)
+            raise InputError(f"--sensor: expected 3 finite numbers, found {found}")
 
 
 def find_inputs(paths: Sequence[Path]) -> list[Path]:
@@ -130,10 +139,11 @@ def _read_npz(
 ) -> tuple[Num[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None, np.ndarray | None]:
     try:
         with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
             arrays = {
                 name: _array(path, archive, name)
                 for name in ("points", "color", "sensor")
-                if f"{name}.npy" in archive.namelist()
+                if name in names
             }
     except (zipfile.BadZipFile, EOFError, ValueError, OSError, RuntimeError) as error:
         if isinstance(error, InputError):
@@ -141,7 +151,8 @@ def _read_npz(
         raise InputError(f"{path}: expected a readable .npz file, found {error}") from error
     points, color, sensor = (arrays.get(name) for name in ("points", "color", "sensor"))
     if points is None or points.ndim != 2 or points.shape[1] != 3:
-        found = "none" if points is None else f"one of shape {points.shape}"
+        there = ", ".join(names[:9]) or "none"
+        found = there if points is None else f"one of shape {points.shape}"
         raise InputError(f"{path}: expected an array points of shape (N, 3), found {found}")
     if color is not None and color.shape != points.shape:
         raise InputError(f"{path}: color: expected shape {points.shape}, found {color.shape}")

@@ -20,6 +20,7 @@ from bench.runs.train import pick_device
 from bench.scoring.scores import to_arrays
 from scapo.alignment import Alignment, ObjectFrame, unit_length
 from scapo.method import AbstractMethod, OracleMethod, evenly
+from scapo.predictor import find as find_checkpoint
 from scapo.records import map_tensors
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import check_header, require_fields
@@ -50,20 +51,24 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         what it takes to load it and to read the clouds.
 
     Raises:
-        ValueError: `oracle` for a method that cannot use labels.
+        ValueError: `oracle` for a method that cannot use labels; no clouds at all, or at a time.
         StoreError: No checkpoint, no such data, or a file of another suffix to write.
     """
     require_suffix(request.out, ".safetensors")
-    method, header = load(request.checkpoint)
-    require_fields(header, ("seed", "steps"), request.checkpoint)
+    for name, count in (("limit", request.limit), ("batch", request.batch)):
+        if count is not None and count < 1:
+            raise ValueError(f"{name}: expected 1 or more, found {count}")
+    run = find_checkpoint(request.checkpoint)
+    method, header = load(run)
+    require_fields(header, ("seed", "steps"), run)
     device = pick_device(request.device)
     method.to(device)
-    known = check_header(header, str(request.checkpoint)).alignment
+    known = check_header(header, str(run)).alignment
     alignment = None if request.own_frame else known
     oracle = _oracle_words(method) if request.oracle else []
     split = open_split(request.data, header["category"], request.split)
     samples = SampleDataset(split, observed(split))
-    chosen = evenly(len(samples), request.limit or len(samples))
+    chosen = evenly(len(samples), request.limit)
     parts: list[Arrays] = []
     seconds = 0.0
     for index in watch(chosen.split(request.batch)):
@@ -78,7 +83,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         "batch": request.batch,
         "parameters": sum(item.numel() for item in method.parameters()),
         "steps": header["steps"],
-        **timing(request.checkpoint),
+        **timing(run),
         "seconds_per_cloud": round(seconds / len(chosen), 6),
     }
     made = _made(method, header, "-".join(word for word in words if word), split, budget)

@@ -25,6 +25,7 @@ from bench.requests import (
     Request,
     StabilityRequest,
     StudyRequest,
+    require_some,
 )
 from bench.runs.predict import Watch, predict
 from bench.runs.stability import measure_stability
@@ -47,8 +48,10 @@ def study(request: StudyRequest, say: Callable[[str], None], watch: Watch = iter
         The page.
 
     Raises:
+        UsageError: No runs.
         StoreError: No such run or data, or two runs of one name.
     """
+    require_some("RUN", request.runs)
     modes: tuple[Mode, ...] = ("fast", "refine") if request.mode == "both" else (request.mode,)
     work = _Study(request, say, watch)
     entries: list[Entry] = []

@@ -68,10 +68,17 @@ def score_best(truth: Truth, rows: Rows, score: Score, revolute: np.ndarray) -> 
 
 
 def _turned_by(errors: Errors) -> Float[np.ndarray, " B"]:
-    """Degrees; the same for all samples without an answer."""
-    degrees = errors["part_rotation", "deg"].mean(1)
-    joints = errors["joint_direction", "deg"].mean(1)
+    """Degrees, of the slots with an answer; the same for all samples without any."""
+    degrees = _mean_of_known(errors["part_rotation", "deg"])
+    joints = _mean_of_known(errors["joint_direction", "deg"])
     return np.nan_to_num(np.where(np.isnan(degrees), joints, degrees), nan=np.inf)
+
+
+def _mean_of_known(values: Float[np.ndarray, "B K"]) -> Float[np.ndarray, " B"]:
+    known = ~np.isnan(values)
+    count = known.sum(1)
+    total = np.where(known, values, 0).sum(1)
+    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)
 
 
 def turned_truth(

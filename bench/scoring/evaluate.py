@@ -178,7 +178,7 @@ def open_data(request: Request) -> tuple[Header, Split]:
     if header.split != request.split:
         raise StoreError(
             f"{request.predictions}: header field 'split': expected "
-            f"{request.split!r}, found {header.split!r}"
+            f"{request.split!r}, found {header.split!r}: --split {header.split}?"
         )
     return header, find_data(request.data, header)
 

@@ -86,7 +86,7 @@ class Counts:
     samples: int
     instances: int
     unanswered: dict[str, int]
-    """Samples without an answer, by tensor."""
+    """Samples without an answer, or without one of a part or joint, by tensor."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -166,7 +166,7 @@ def reconstruction(truth: Truth, rows: Rows) -> Float[np.ndarray, " B"]:
     Each point of the object (true label of a part) goes back to the method's canonical frame by
     the inverse of the predicted pose of its predicted part; its distance is that to the nearest
     of `canonical_points`. One way only: what the camera does not see cannot be missed. NaN
-    without poses, and for a sample without an answer in any of the three tensors.
+    without poses, and for a sample without an answer in any of the three tensors or to any part.
     """
     out = np.full(len(truth), np.nan)
     if "camera_T_part" not in rows:

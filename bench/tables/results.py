@@ -57,6 +57,8 @@ class Results:
                 readings of a run are of different predictions.
         """
         self._runs: dict[tuple[Series, Place], dict[int, Scores]] = {}
+        self.splits = sorted({item.run.split for item in scores})
+        """Of all scores, those that are left out too."""
         digests: dict[Place, tuple[str, Path]] = {}
         for item in scores:
             if item.run.split not in (split, UNSEEN_SPLIT):

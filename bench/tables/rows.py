@@ -258,7 +258,7 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
 
 
 def _answered(counts: Counts) -> str:
-    """Samples, and how many of them have an answer: others are in no mean, but fail in precision.
+    """Samples, and how many have every answer: what others lack is in no mean, but fails the AP.
 
     >>> _answered(Counts(samples=1000, instances=50, unanswered={"part_weight": 700}))
     '1000 samples, 300 of them answered'

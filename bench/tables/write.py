@@ -93,10 +93,11 @@ def make_tables(
     """
     results, actuations = load(scores, split), load_actuations(scores, split)
     if not results.all_runs() and not actuations:
-        raise StoreError(
-            f"{scores}: expected scores on {split} (NAME.csv.gz), found none; "
-            "`scapo-bench evaluate` writes them"
-        )
+        there = results.splits
+        found = "none; `scapo-bench evaluate` writes them"
+        if there:
+            found = f"those on {', '.join(there)}; --split {there[0]} makes tables of these"
+        raise StoreError(f"{scores}: expected scores on {split} (NAME.csv.gz), found {found}")
     tables = (*build(results, rule), table_7(actuations))
     tables = tuple(map(ours_of, tables)) if only_ours else tables
     return Made(scores=scores, results=results, tables=tuple(map(noted, tables)), rule=rule)

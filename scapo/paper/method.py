@@ -204,7 +204,7 @@ class Scapo(AbstractMethod):
         if self._run is None:
             if self.config.start is None:
                 raise ValueError(
-                    "start: expected the run folder of a trained `registered`, found none; "
+                    "--start: expected the run folder of a trained `registered`, found none; "
                     "`scapo-bench train registered --category C --data DIR --out RUN` makes one"
                 )
             run = load_run(Path(self.config.start), self.category)

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, cast, get_args
 
-from scapo.categories import CATEGORIES, Category, Window, check_category
+from scapo.categories import CATEGORIES, Category, JointKind, Window, check_category
 from scapo.store.json_records import StoreError, from_json
 from scapo.store.manifest import Manifest
 from scapo.store.regular import read_regular
@@ -42,7 +42,8 @@ def read_categories(path: Path) -> dict[str, Category]:
     try:
         tables = tomllib.loads(read_regular(path, MAX_TOML).decode())
     except (OSError, ValueError, RecursionError) as error:
-        raise StoreError(f"{path}: expected categories in TOML, found {error}") from error
+        found = {FileNotFoundError: "none", IsADirectoryError: "a folder"}.get(type(error), error)
+        raise StoreError(f"{path}: expected categories in TOML, found {found}") from error
     if not tables:
         raise StoreError(f"{path}: expected a table for each category, found none")
     return {name: _read(name, table, f"{path}: {name}") for name, table in tables.items()}
@@ -76,13 +77,21 @@ def _joint(joint: object, j: int, where: str) -> object:
         raise StoreError(
             f"{where}: joints[{j}]: expected {', '.join(sorted(known))}, found {unknown[0]!r}"
         )
+    kinds = get_args(JointKind)
+    if said.get("kind", kinds[0]) not in kinds:
+        raise StoreError(
+            f"{where}: joints[{j}].kind: expected {' or '.join(kinds)}, found {said['kind']!r:.100}"
+        )
     record = {"parent": 0, "child": j + 1, "lower": 0.0, **said}
     degrees = record.pop("degrees", None)
     if degrees is not None:
         if isinstance(degrees, bool) or not isinstance(degrees, int | float) or "upper" in said:
             raise StoreError(f"{where}: joints[{j}]: expected degrees, a number, or upper")
         if said.get("kind") != "revolute":
-            raise StoreError(f"{where}: joints[{j}]: degrees: expected only of a revolute joint")
+            raise StoreError(
+                f"{where}: joints[{j}]: degrees: expected only of a revolute joint, found "
+                f"{said.get('kind', 'none')}"
+            )
         record["upper"] = math.radians(degrees)
     return record
 

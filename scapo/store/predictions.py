@@ -2,8 +2,8 @@
 """Predictions files: the header, the tensors, and the refusal of what is not one.
 
 One safetensors file, written by any program (docs/bring-your-own-method.md). Every complaint is
-one line: `file: tensor: expected, found`. A sample whose whole row of a tensor is NaN has no
-answer there: it is counted and its scores are empty.
+one line: `file: tensor: expected, found`. A sample whose whole row of a tensor is NaN has no answer
+there, nor has a part or joint with a NaN among its own numbers: scores are empty and counted.
 """
 
 from __future__ import annotations
@@ -248,7 +248,8 @@ class Predictions:
         self.header = read_prediction_header(path)
         check_belongs(path, self.header, split.manifest)
         self.unanswered: dict[str, int] = {}
-        """Samples without an answer so far, by tensor."""
+        """Samples without an answer, or without one of a part or joint, so far, by tensor."""
+        self._answered = False
         self._count = split.manifest.count
         self._parts = len(split.manifest.parts)
         frame = self.header.object_frame
@@ -295,27 +296,33 @@ class Predictions:
                 ) from error
             where = f"{self.path}: tensor {name!r}"
             out[name], missing = check_rows(where, name, array, first, self._parts)
+            if name.startswith(CONFIDENCE):  # no answer
+                continue
             self.unanswered[name] = self.unanswered.get(name, 0) + missing
+            known = out[name] >= 0 if name == "part" else ~np.isnan(out[name])
+            self._answered |= bool(known.any())
         return out
 
     def finish(self) -> None:
-        """After the last block: refuse a tensor in which no sample has an answer.
+        """After the last block: refuse a file that answers nothing at all.
 
         Raises:
-            StoreError: Naming the tensor.
+            StoreError: No tensor has an answer for any sample; a confidence is none.
         """
-        for name, missing in self.unanswered.items():
-            if self._count and missing == self._count:
-                raise StoreError(
-                    f"{self.path}: tensor {name!r}: expected an answer for at least "
-                    f"one of {self._count} samples, found NaN in all"
-                )
+        if self._count and not self._answered:
+            raise StoreError(
+                f"{self.path}: expected an answer for at least one of {self._count} samples, "
+                f"found none in {', '.join(self.names)}"
+            )
 
 
 _FLOAT = ("F32",)
 _HALF_OR_FLOAT = ("F16", "F32")
 _NUMBER = ("F16", "F32", "F64")
 
+CONFIDENCE = "confidence_"
+SLOTTED = ("camera_T_part", "joint_pivot", "joint_axis", "joint_state")
+"""Tensors of parts or joints, each of which may lack its answer alone."""
 MAX_VALUES = 1 << 18
 """Of a tensor's row: a sparse file may say that it holds terabytes."""
 ROTATION_TOLERANCE = 1e-3
@@ -348,7 +355,7 @@ def check_tensors(where: str, file: Any, split: Split) -> dict[str, Any]:  # noq
     for name in file.keys():  # noqa: SIM118 - an open file, not a dict
         item = file.get_slice(name)
         expected = layout.get(name)
-        if expected is None and name.startswith("confidence_"):
+        if expected is None and name.startswith(CONFIDENCE):
             expected = (_HALF_OR_FLOAT, (count, *item.get_shape()[1:]))
         if expected is None:
             raise StoreError(
@@ -394,7 +401,9 @@ def _check_tensor(
 def check_rows(
     where: str, name: str, array: np.ndarray, first: int, parts: int
 ) -> tuple[np.ndarray, int]:
-    """A block of one tensor after checking its values, and how many samples have no answer.
+    """A block of one tensor after checking its values, and how many samples lack an answer.
+
+    A part or joint with a NaN among its numbers comes back as NaN alone: half an answer is none.
 
     Args:
         where: File and tensor, for the message.
@@ -408,22 +417,22 @@ def check_rows(
     """
     if name == "part":
         return _check_labels(where, array, first, parts)
-    flat = array.reshape(len(array), -1)
-    missing = np.isnan(flat).all(1)
-    finite = np.isfinite(flat).all(1)
-    _refuse(
-        np.asarray(~(finite | missing)),
-        where,
-        first,
-        "finite values or a row of NaN alone",
-        lambda i: "some NaN" if np.isnan(flat[i]).any() else "an infinite value",
-    )
-    known = np.flatnonzero(finite)
+    alone = name in SLOTTED or (name.startswith(CONFIDENCE) and array.ndim > 1)
+    slots = array.reshape(len(array), array.shape[1] if alone else 1, -1)
+    infinite = np.asarray(np.isinf(slots).any((1, 2)))
+    _refuse(infinite, where, first, "finite values or NaN", lambda i: "an infinite value")
+    lost = np.isnan(slots)
+    some = np.asarray(lost.any(2))
+    half = some & ~np.asarray(lost.all(2))
+    if not alone:
+        _refuse(half[:, 0], where, first, "a row of NaN or none", lambda i: "some NaN")
+    if half.any():
+        array = np.where(some[..., None], array.dtype.type(np.nan), slots).reshape(array.shape)
     if name == "part_weight":
-        _check_weights(where, array, known, first)
+        _check_weights(where, array, np.flatnonzero(~some[:, 0]), first)
     if name == "camera_T_part":
-        _check_poses(where, array, known, first)
-    return array, int(missing.sum())
+        _check_poses(where, array, ~some, first)
+    return array, int(np.asarray(some.any(1)).sum())
 
 
 def _refuse(
@@ -468,18 +477,14 @@ def _check_weights(where: str, array: np.ndarray, known: np.ndarray, first: int)
     _refuse(wrong, where, first, "weights of 0 or more", lambda i: f"{lowest[i]:.4g}")
     error = np.abs(total - np.float32(1)).max(1)
     wrong[known] = error[known] > tolerance
-    _refuse(
-        wrong,
-        where,
-        first,
-        f"weights of a point to sum to 1 within {tolerance}",
-        lambda i: f"an error of {error[i]:.4g}",
-    )
+    expected = f"weights of a point to sum to 1 within {tolerance}"
+    _refuse(wrong, where, first, expected, lambda i: f"an error of {error[i]:.4g}")
 
 
 def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -> None:
-    worst = np.zeros(len(array))
-    worst[known] = rotation_error(array[known][..., :3, :3]).max(1)
+    worst = np.zeros(known.shape)
+    worst[known] = rotation_error(array[known][:, :3, :3])
+    worst = worst.max(1)
     _refuse(
         worst > ROTATION_TOLERANCE,
         where,
@@ -487,12 +492,8 @@ def _check_poses(where: str, array: np.ndarray, known: np.ndarray, first: int) -
         f"rotations with R R^T = I within {ROTATION_TOLERANCE} and det R = 1",
         lambda i: f"an error of {worst[i]:.4g}" if worst[i] != 2 else "a reflection",
     )
-    last = np.zeros(len(array))
-    last[known] = np.abs(array[known][..., 3, :] - np.array([0, 0, 0, 1])).max((-1, -2))
-    _refuse(
-        last > ROTATION_TOLERANCE,
-        where,
-        first,
-        "a last row 0 0 0 1",
-        lambda i: f"an error of {last[i]:.4g}",
-    )
+    last = np.zeros(known.shape)
+    last[known] = np.abs(array[known][:, 3, :] - np.array([0, 0, 0, 1])).max(-1)
+    last = last.max(1)
+    wrong = np.asarray(last > ROTATION_TOLERANCE)
+    _refuse(wrong, where, first, "a last row 0 0 0 1", lambda i: f"an error of {last[i]:.4g}")

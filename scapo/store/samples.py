@@ -20,25 +20,16 @@ from torch.utils.data import Dataset
 
 from scapo.records import map_tensors, take
 from scapo.store.files import SAMPLES, Arrays, read_header, require, tensor_names
-from scapo.store.schema import LAYOUT, UNLABELLED, StoreError, check_samples
+from scapo.store.schema import (
+    LAYOUT,
+    OPTIONAL,
+    TENSORS,
+    UNLABELLED,
+    StoreError,
+    check_samples,
+)
 from scapo.store.split import Split, check_bytes, open_split
 from scapo.types import Joints, Labels, Observation, Supervision
-
-TENSORS = (
-    "points",
-    "part",
-    "camera_T_part",
-    "joint_pivot",
-    "joint_axis",
-    "joint_state",
-    "visible",
-    "camera",
-    "instance",
-)
-
-
-OPTIONAL = ("color", "sensor")
-"""What a split may have besides."""
 
 
 class SampleDataset(Dataset[dict[str, Tensor]]):

@@ -43,6 +43,9 @@ optional, and so are `sensor`, the camera's centre in metres where clouds are no
 the four of ambiguity (docs/ambiguity.md)."""
 ALIKE = ("alike", "alike_base", "alike_state", "alike_part")
 """The tensors of ambiguity, all there or none."""
+OPTIONAL = ("color", "sensor")
+TENSORS = tuple(name for name in LAYOUT if name not in (*OPTIONAL, *ALIKE))
+"""What every shard has."""
 
 
 @runtime_checkable

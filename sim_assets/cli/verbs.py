@@ -304,24 +304,31 @@ class Info:
     """Source of the objects: the folder of models that the set was made from, to measure them."""
 
     def run(self, console: Console) -> int:
-        """Print counts, histograms and digests of every split; 1 if a shard is damaged."""
+        """Print counts, histograms and digests of every split, the damaged among them.
+
+        Raises:
+            StoreError: What is wrong with the first split that is damaged, and how many are.
+        """
         from scapo.store import Split, StoreError
         from sim_assets.describe.info import describe_split, find_splits
         from sim_assets.inspect.variation import Variation
 
-        whole, variation = True, Variation(self.source)
-        for folder in find_splits(self.path):
+        damaged, variation = list[str](), Variation(self.source)
+        folders = find_splits(self.path)
+        for folder in folders:
             try:
                 split = Split(folder)
             except StoreError as error:
                 say(console, error, label="DAMAGED", style="red")
-                whole = False
+                damaged.append(str(error))
                 continue
             report = describe_split(split)
             lines = [report.text, *variation.lines(split)]
             console.print("\n".join(lines), soft_wrap=True, highlight=False, markup=False)
-            whole &= report.whole
-        return 0 if whole else 1
+            damaged += [report.damage] if report.damage else []
+        if damaged:
+            raise StoreError(f"{damaged[0]} ({len(damaged)} of {len(folders)} splits are damaged)")
+        return 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

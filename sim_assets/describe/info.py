@@ -13,7 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from scapo.store import Split, StoreError
+from scapo.store.files import require
 from scapo.store.manifest import Manifest
+from scapo.store.schema import TENSORS
 from scapo.text import one_line
 from sim_assets.sampling.viewpoints import direction_angles
 
@@ -27,8 +29,8 @@ class Report:
     """Of one split."""
 
     text: str
-    whole: bool
-    """Whether all shards have the bytes that the manifest says."""
+    damage: str = ""
+    """What is wrong with the first shard that is not what manifest and layout say."""
 
 
 def find_splits(path: Path) -> list[Path]:
@@ -48,16 +50,19 @@ def find_splits(path: Path) -> list[Path]:
 
 
 def describe_split(split: Split) -> Report:
-    """The report of one split; its shards are read, and compared with their hashes."""
+    """The report of one split; its shards are compared with their hashes, and read whole."""
     manifest = split.manifest
     lines = [one_line(split.folder), *map(_line, _facts(manifest))]
     try:
         split.verify()
+        for shard, arrays in zip(manifest.shards, split.shards(), strict=True):
+            require(split.folder / shard.file, TENSORS, arrays)
         lines += map(_line, histograms(split))
         lines.append(f"  shards     {len(manifest.shards)}, all whole")
     except StoreError as error:
-        return Report(text="\n".join([*lines, _line(f"DAMAGED    {error}")]), whole=False)
-    return Report(text="\n".join(lines), whole=True)
+        text = "\n".join([*lines, _line(f"DAMAGED    {error}")])
+        return Report(text=text, damage=str(error))
+    return Report(text="\n".join(lines))
 
 
 def _facts(manifest: Manifest) -> list[str]:

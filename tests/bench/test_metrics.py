@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -140,6 +141,48 @@ def test_symmetry_turns_swapped_samples_only():
     np.testing.assert_array_equal(found["order"], [[1, 0], [1, 0], [0, 1], [0, 1]])
     without = sample_errors(**case)
     np.testing.assert_allclose(without["part_rotation"][:2], 180, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["label_order", "iou", "pivot", "rotation"])
+def test_an_unknown_reading_is_refused_by_name(name):
+    with pytest.raises(ValueError, match=f"{name}: expected one of .*, found 'bogus'"):
+        inspect.unwrap(sample_errors)(**random_case(0), **{name: "bogus"})  # types unchecked
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("pivot", ["point-line", "line-line"])
+def test_what_is_not_finite_is_undefined_in_its_slot_alone(value, pivot):
+    """Warnings are errors here: nothing is computed with an infinity."""
+    case = random_case(5, parts=3)
+    whole = sample_errors(**case, pivot=pivot)
+    case["camera_T_part_pred"][0, 1, 0, 3] = value
+    case["camera_T_part_pred"][1, 2, :3, :3] = value
+    case["pivot_pred"][0, 1, 2] = value
+    case["axis_pred"][1, 0] = value
+    found = sample_errors(**case, pivot=pivot)
+    lost = {"part_translation": [(0, 1)], "part_rotation": [(1, 2)], "joint_direction": [(1, 0)],
+            "joint_pivot": [(0, 1)] + [(1, 0)] * (pivot == "line-line")}  # fmt: skip
+    for key in KEYS:
+        expected = whole[key].astype(float)
+        for place in lost.get(key, []):
+            expected[place] = np.nan
+        np.testing.assert_array_equal(found[key], expected, err_msg=key)
+
+
+@pytest.mark.parametrize("iou", ["hard", "soft"])
+def test_an_infinite_weight_is_no_answer_of_its_point(iou):
+    case = random_case(6)
+    weight = np.eye(2)[case["part_true"]]
+    weight[0, 0] = np.inf
+    labels = case["part_true"].copy()
+    labels[0, 0] = -1
+    case["part_pred"] = labels
+    with_labels = sample_errors(**case)["iou"]
+    case["part_pred"] = weight
+    found = sample_errors(**case, iou=iou)["iou"]
+    np.testing.assert_allclose(found, with_labels)
+    assert found[0].min() < 1
+    np.testing.assert_array_equal(found[1:], 1)
 
 
 def test_states_go_around_the_circle_and_follow_the_axis():

@@ -139,6 +139,20 @@ def test_labels_alone_leave_dashes(split, tmp_path):
     assert {rung for rung, _, _ in found} == set(RUNGS)
 
 
+def test_missing_slots_are_in_no_rung_that_would_need_them(split, tmp_path):
+    arrays = made.truth_as_prediction(split, weights=True)
+    arrays["part_weight"] = np.full_like(arrays["part_weight"], np.nan)
+    arrays["camera_T_part"][:, 1] = np.nan
+    arrays["joint_state"][:, 0] = np.nan
+    found = ladder(split, arrays, tmp_path)
+    assert np.isnan(found["predicted", "iou", "1"])
+    assert found["predicted", "part_rotation", "deg"] == pytest.approx(0, abs=0.1)  # the base's
+    states = [value for (rung, metric, _), value in found.items()
+              if (rung, metric) == ("predicted", "joint_state")]  # fmt: skip
+    single = arrays["joint_state"].shape[1] == 1
+    assert all(np.isnan(value) if single else value < 1e-4 for value in states)
+
+
 def test_factors_say_where_the_camera_is(tmp_path):
     """Cameras placed by hand about an object at the origin."""
     arrays = made.sample_arrays("laptop", 4, 30)

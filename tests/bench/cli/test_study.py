@@ -67,6 +67,14 @@ def test_runs_of_one_name_are_refused(tmp_path, capsys) -> None:
     assert "found 'laptop-scapo-cpu-seed1' twice" in capsys.readouterr().err
 
 
+def test_no_run_is_wrong_usage(tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        program.main(["study", "--data", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "scapo-bench: RUN: expected one or more, found none\n"
+    assert not (tmp_path / "out").exists()
+
+
 def test_joined_leaves_the_others_without_an_answer() -> None:
     parts = [{"x": np.ones((2, 3), np.float32)}, {"x": np.full((1, 3), 2, np.float32)}]
     full = joined(parts, np.array([0, 2, 3]), 5)["x"]

@@ -99,7 +99,9 @@ def test_cameras_of_other_images_are_refused(text, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{", "JSON or YAML"), ("[1]", "a matrix K or num"), ('{"K": [1, 2]}', "a matrix K or num"),
+    [("{", "JSON or YAML"), ('{"fx": 1,\n "fy": 2', "JSON or YAML, found expected .* in line 2, "),
+     ('{"fx": 1, "fy": , "cx": 1, "cy": 1}', r"found the values \[1, None, 1, 1\]"),
+     ("[1]", "a matrix K or num"), ('{"K": [1, 2]}', "a matrix K or num"),
      ('{"fx": 1}', r"found \['fx'\]"),
      ('{"fx": NaN, "fy": 1, "cx": 1, "cy": 1}', r"found the values \['NaN', 1, 1, 1\]"),
      ("!!python/object/apply:os.system [ls]", "JSON or YAML")],
@@ -107,8 +109,9 @@ def test_cameras_of_other_images_are_refused(text, message):
 def test_files_that_are_no_camera_are_refused(text, message, tmp_path):
     path = tmp_path / "camera.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=message) as refused:
         read_intrinsics(str(path), WIDTH, HEIGHT)
+    assert "\n" not in str(refused.value)
 
 
 def test_what_is_no_depth_image_is_refused(image, tmp_path):
@@ -119,6 +122,10 @@ def test_what_is_no_depth_image_is_refused(image, tmp_path):
         read_depth(mask, CAMERA, mask, None)
     with pytest.raises(InputError, match=r"expected depths of 0.02 to 50.0 m, found 1.23e\+03"):
         read_depth(path, CAMERA, mask, 1.0)
+    with pytest.raises(InputError, match=r"gone\.png: expected a readable mask, found none$"):
+        read_depth(path, CAMERA, tmp_path / "gone.png", None)
+    with pytest.raises(InputError, match=r"expected a readable mask, found a folder$"):
+        read_depth(path, CAMERA, tmp_path, None)
     Image.fromarray(np.zeros((8, 9), np.uint8)).save(tmp_path / "small.png")
     with pytest.raises(InputError, match="64 x 48, found 9 x 8"):
         read_depth(path, CAMERA, tmp_path / "small.png", None)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import __main__ as program
 from bench.infer.cloud import Cloud, InputError
-from bench.infer.infer import answer, distinct_names
+from bench.infer.infer import Done, answer, distinct_names, summary
 from scapo.categories import CATEGORIES
 from tests.helpers.placed import Told, placed_run, told_model
 
@@ -83,6 +83,21 @@ def test_a_single_failure_is_one_line(data, message, run, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", ["a.npz", "a.png"])
+def test_a_scale_of_zero_is_refused_for_clouds_and_images(name, run, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert call("infer", tmp_path / name, "--run", run, "--out", out, "--scale", "0") == 1
+    assert "--scale: expected a finite number above 0, found 0" in capsys.readouterr().err
+
+
+def test_no_input_is_wrong_usage(tmp_path, capsys):
+    assert call("infer", "--out", tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert said == "scapo-bench: INPUT: expected one or more, found none\n"
+    assert call("infer", "--help") == 0
+    assert "(default: )" not in capsys.readouterr().out
+
+
 def test_a_missing_model_is_said_before_anything_is_read(tmp_path, capsys):
     assert call("infer", "none.ply", "--run", tmp_path / "no", "--out", tmp_path / "out") == 1
     assert "expected a run folder" in capsys.readouterr().err
@@ -101,6 +116,17 @@ def test_the_model_that_explains_the_view_answers(told):
     close = answer("a", cloud, [other, right], "fast", "category")
     assert close.choice.margin == pytest.approx(0)
     assert "the category is doubtful" in close.twin.warnings[-1]
+
+
+def test_the_confidence_in_the_line_is_of_the_axis(told):
+    """It says nothing of the state; a model with zeros of its own does not know what is open."""
+    cloud = Cloud(points=told.clouds()[0])
+    found = answer("a", cloud, [told_model(told)], "fast", "category")
+    twin = replace(found.twin, state=np.array([0.75]), joint_confidence=np.array([0.974]))
+    done = Done(source=Path("a"), result=replace(found, twin=twin, aligned=True))
+    assert "door open 43.0 degrees (axis 97 % sure within 5 degrees)" in summary(done)
+    done = Done(source=Path("a"), result=replace(found, twin=twin, aligned=False))
+    assert "oven, door 43.0 degrees (axis 97 % sure" in summary(done)
 
 
 def test_names_of_folders_are_distinct():

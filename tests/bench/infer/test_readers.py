@@ -98,7 +98,8 @@ BROKEN = {
     "wide.npz": (zipped(points=header("(100, 900000000000)")), "three numbers a row"),
     "pickle.npz": (zipped(points=header("(100, 3)", "|O")), "expected numbers"),
     "lies.npz": (zipped(points=header("(100, 3)")), "expected a readable .npz"),
-    "other.npz": (npz(xyz=POINTS), r"an array points of shape \(N, 3\), found none"),
+    "other.npz": (npz(xyz=POINTS, rgb=COLOR), r"array points of shape \(N, 3\), found xyz, rgb$"),
+    "nothing.npz": (zipped(), r"an array points of shape \(N, 3\), found none$"),
     "flat.npz": (npz(points=POINTS[:, :2]), r"found one of shape \(300, 2\)"),
     "tint.npz": (npz(points=POINTS, color=COLOR[:5]), "color: expected shape"),
     "far.npz": (npz(points=POINTS, sensor=np.zeros(2)), "sensor: expected 3 finite numbers"),
@@ -116,6 +117,18 @@ def test_what_is_broken_is_named(name, tmp_path):
     with pytest.raises(InputError, match=message) as refused:
         read_input(path, ReadOptions())
     assert str(path) in str(refused.value)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
+def test_a_scale_that_no_unit_has_is_refused(scale):
+    with pytest.raises(InputError, match="--scale: expected a finite number above 0, found"):
+        ReadOptions(scale=scale)
+
+
+@pytest.mark.parametrize("place", [(0.0, np.nan, 1.0), (np.inf, 0.0, 0.0)])
+def test_a_camera_stands_somewhere(place):
+    with pytest.raises(InputError, match="--sensor: expected 3 finite numbers, found"):
+        ReadOptions(sensor=place)
 
 
 def test_flags_of_depth_images_are_refused_for_clouds(tmp_path):

@@ -19,6 +19,7 @@ from bench.requests import PredictRequest
 from bench.runs import predict as predicting
 from bench.runs.train import pick_device
 from bench.scoring.scores import to_arrays
+from scapo import predictor
 from scapo.method import OracleMethod
 from scapo.paper.method import Scapo
 from scapo.store import open_split
@@ -134,6 +135,28 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
         np.testing.assert_allclose(value, read(out)[0][name], atol=1e-4)
 
 
+@pytest.mark.parametrize("flag", ["--limit", "--batch"])
+@pytest.mark.parametrize("count", [0, -3])
+def test_no_clouds_are_refused(
+    flag: str, count: int, run: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "p.safetensors"
+    said = fails(capsys, "predict", run, "--data", data, "--out", out, flag, count)
+    assert f"{flag[2:]}: expected 1 or more, found {count}" in said
+    assert not out.exists()
+
+
+def test_a_released_model_is_asked_by_its_category(
+    run: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(predictor, "_weights", lambda: {"laptop": run / "checkpoint.safetensors"})
+    monkeypatch.chdir(tmp_path)
+    command("predict", "laptop", "--data", data, "--out", "named.safetensors", "--device", "cpu")
+    command("predict", run, "--data", data, "--out", "run.safetensors", "--device", "cpu")
+    for name, value in read(tmp_path / "run.safetensors")[0].items():
+        np.testing.assert_array_equal(value, read(tmp_path / "named.safetensors")[0][name])
+
+
 def test_the_time_of_a_cloud_is_the_methods_alone(
     run: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -182,7 +205,7 @@ def test_bad_input_is_one_line(
     run: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = ["--out", tmp_path / "x.safetensors"]
-    assert "expected a file, found none" in fails(
+    assert "expected a run folder, a checkpoint or a category" in fails(
         capsys, "predict", tmp_path / "none", "--data", data, *out
     )
     assert "--oracle: expected a method that takes one, found scapo" in fails(

@@ -124,6 +124,17 @@ def test_no_answer_stays_no_answer(tmp_path):
     assert report["summary"]["part_rotation_deg"]["undefined"] == 2
 
 
+def test_a_part_without_an_answer_leaves_the_turn_to_the_others(tmp_path):
+    """Its pose alone is empty; the other parts, and not the axes, still say which turn is meant."""
+    split, arrays, turned = data(tmp_path / "data", "eyeglasses")
+    answer = turned_answer(split, arrays, turned)
+    answer["camera_T_part"][:, 2] = np.nan
+    answer["joint_axis"] = np.roll(answer["joint_axis"], 1, 2)  # no turn explains these
+    on, _ = score(split, answer, tmp_path, settings=ON)
+    assert np.isnan(on["part_rotation", "deg"][:, 2]).all()
+    assert on["part_rotation", "deg"][::2, :2].max() < 0.02
+
+
 def test_data_that_do_not_say_are_refused(tmp_path):
     split = made.make_data(tmp_path / "data", "laptop", count=4, train=4, points=48)
     with pytest.raises(StoreError, match="expected tensor 'alike' for --ambiguity on"):

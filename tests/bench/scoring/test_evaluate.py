@@ -272,6 +272,9 @@ def test_the_command(laptop, tmp_path, capsys):
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert error.startswith("scapo-bench: ")
+    assert run_program("evaluate", "--predictions", path, "--data", root(laptop), "--split", "val",
+                       "--out", out) == 1  # fmt: skip
+    assert "'split': expected 'val', found 'test': --split test?" in capsys.readouterr().err
     assert run_program(*bad[:-1], tmp_path / "scores.csv") == 1
     assert "expected a name that ends in .csv.gz" in capsys.readouterr().err
     for words in (["predict", "gone"], ["stability", "gone"], ["reference", "constant"]):

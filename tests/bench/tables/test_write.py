@@ -296,6 +296,17 @@ def test_names_cannot_break_latex():
     assert escape("é") == "?"
 
 
+def test_scores_of_another_split_are_named_with_the_flag(tmp_path, capsys):
+    make_scores(tmp_path, "scapo", "laptop", split="val")
+    with pytest.raises(SystemExit) as ended:
+        program.main(["tables", "--scores", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert "expected scores on test (NAME.csv.gz), found those on val; --split val" in said
+    program.main(["tables", "--scores", str(tmp_path), "--out", str(tmp_path / "out"),
+                  "--split", "val"])  # fmt: skip
+
+
 def test_the_commands(scores, tmp_path, capsys):
     folder, _ = scores
     program.main(["tables", "--scores", str(folder), "--out", str(tmp_path), "--ap-rule", "min"])

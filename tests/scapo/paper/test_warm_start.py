@@ -238,7 +238,7 @@ def test_the_run_is_read_from_disk_and_is_no_part_of_the_model(run: Path) -> Non
 
 def test_a_start_that_cannot_be_is_refused(run: Path, tmp_path: Path) -> None:
     observation = oracle()[1]
-    with pytest.raises(ValueError, match="start: expected the run folder of a trained"):
+    with pytest.raises(ValueError, match="--start: expected the run folder of a trained"):
         warm(None).start(CANONICALISE, observation, Labels(), generator(1))
     with pytest.raises(StoreError, match="expected a file, found none"):
         warm(tmp_path).start(CANONICALISE, observation, Labels(), generator(1))

@@ -65,6 +65,11 @@ def test_a_file_is_read_as_written(tmp_path):
         ("diagonal = 1", "diagonal = 1\nbenchmark = []", "fields of Category but benchmark"),
         ("degrees = 90", "degrees = 90, upper = 1", "joints[0]: expected degrees, a number, or"),
         ("degrees = 90", "degrees = -90", "joints[0]: expected 0 <= lower < upper"),
+        (
+            '"revolute", degrees',
+            '"helical", degrees',
+            "joints[0].kind: expected revolute or prismatic, found 'helical'",
+        ),
         ("degrees = 90", "angle = 90", "joints[0]: expected child, degrees, kind, lower, parent"),
         ('"revolute", degrees = 90', '"prismatic", degrees = 90', "degrees: expected only of a"),
         ('"revolute", degrees = 90', '"prismatic", upper = 1', "joints: expected all of one kind"),
@@ -88,8 +93,10 @@ def test_what_cannot_be_is_refused_with_its_field(tmp_path, old, new, message):
 
 
 def test_no_file_is_said_in_a_line(tmp_path):
-    with pytest.raises(StoreError, match="expected categories in TOML, found"):
+    with pytest.raises(StoreError, match=r"none\.toml: expected categories in TOML, found none$"):
         read_categories(tmp_path / "none.toml")
+    with pytest.raises(StoreError, match=r"expected categories in TOML, found a folder$"):
+        read_categories(tmp_path)
 
 
 @pytest.mark.parametrize("kind", CATEGORIES.values(), ids=CATEGORIES)

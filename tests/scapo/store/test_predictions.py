@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import csv
+import gzip
+
 import numpy as np
 import pytest
 
@@ -100,6 +103,70 @@ def test_a_row_of_nan_is_no_answer(split, tmp_path):
     assert undefined["part_rotation_deg"] == 3
     assert report["average_precision"]["seg_50"]["k"] == 6
     assert report["average_precision"]["seg_50"]["n"] == 7
+
+
+LOST = {
+    ("camera_T_part", (1, 2)): {"part_rotation_deg": 1, "part_translation_m": 1},
+    ("camera_T_part", (1, 2, 0, 3)): {"part_rotation_deg": 1, "part_translation_m": 1},
+    ("joint_pivot", (0, 0, 1)): {"joint_pivot_m": 1},
+    ("joint_axis", (0, 0, 1)): {"joint_direction_deg": 1},
+    ("joint_state", (2, 0)): {"joint_state_deg": 1},
+}
+"""Where one NaN stands, or a whole slot of them -> values that the scores lack."""
+
+
+@pytest.mark.parametrize(("name", "place"), LOST)
+def test_a_missing_slot_costs_its_own_scores_alone(name, place, split, tmp_path):
+    """The other slots keep their errors of zero, and nothing missing counts as one."""
+    arrays = made.truth_as_prediction(split)
+    arrays[name] = arrays[name].copy()
+    arrays[name][place] = np.nan
+    path = tmp_path / "p.safetensors"
+    path.write_bytes(file_bytes(arrays, header_json(split)))
+    request = Request(predictions=path, data=split.folder.parent.parent, out=tmp_path / "s.csv.gz")
+    report = evaluate(request)
+    summary, precision = report["summary"], report["average_precision"]
+    undefined = {key: row["undefined"] for key, row in summary.items() if row["undefined"]}
+    lost = LOST[name, place]
+    assert {key: n for key, n in undefined.items() if not key.endswith("_r4")} == lost
+    assert all(summary[key]["mean"] < 0.1 for key in lost)
+    # A table tells of such samples: who leaves out what is hard has the better mean.
+    assert report["counts"]["unanswered"] == dict.fromkeys(sorted(arrays), 0) | {name: 1}
+    kind = "part" if name == "camera_T_part" else "joint"
+    assert precision[f"{kind}_15"]["k"] == (7 if name == "joint_state" else 6)
+    with gzip.open(request.out, "rt") as file:
+        rows = [row for row in csv.DictReader(file) if row["value"] == ""]
+    assert {(row["sample"], row["slot"]) for row in rows} == {(str(place[0]), str(place[1]))}
+
+
+@pytest.mark.parametrize(
+    ("name", "metric"),
+    [
+        ("part_weight", "iou_1"),
+        ("camera_T_part", "part_rotation_deg"),
+        ("joint_axis", "joint_direction_deg"),
+        ("joint_state", "joint_state_deg"),
+    ],
+)
+def test_a_tensor_that_answers_nothing_leaves_the_others_scored(name, metric, split, tmp_path):
+    arrays = made.truth_as_prediction(split, weights=True)
+    arrays[name] = np.full_like(arrays[name], np.nan)
+    path = tmp_path / "p.safetensors"
+    path.write_bytes(file_bytes(arrays, header_json(split)))
+    request = Request(predictions=path, data=split.folder.parent.parent, out=tmp_path / "s.csv.gz")
+    report = evaluate(request)
+    assert report["counts"]["unanswered"] == dict.fromkeys(sorted(arrays), 0) | {name: 7}
+    assert report["summary"][metric]["count"] == 0
+    assert report["summary"]["joint_pivot_m"]["count"] == 14
+
+
+def test_half_a_slot_comes_back_as_none():
+    poses = np.tile(np.eye(4, dtype=np.float32), (2, 3, 1, 1))
+    poses[1, 2, 0, 3] = np.nan
+    found, missing = check_rows("here", "camera_T_part", poses, 0, 3)
+    assert np.isnan(found[1, 2]).all()
+    assert np.isfinite(found[1, :2]).all()
+    assert missing == 1
 
 
 @pytest.mark.parametrize("key", ["data_digest", "digest", "data"])

@@ -124,6 +124,15 @@ def test_no_answer_is_a_failure_and_a_lost_object_is_left_out(data, tmp_path, ca
     assert list(left_out(rows)) == ["object 1"]
 
 
+def test_one_missing_joint_fails_alone(data, tmp_path):
+    split = open_split(data, "eyeglasses", "val")
+    axis = split.arrays("joint_axis")["joint_axis"]
+    axis[0, 1, 2] = np.nan
+    path = predicted(split, tmp_path / "p.safetensors", joint_axis=axis)
+    rows = actuate(path, data, tmp_path / "o.csv", limit=1, running=HERE)
+    assert [(row.success, row.reason) for row in rows] == [(True, ""), (False, NO_ANSWER)]
+
+
 def test_what_cannot_be_pulled_at_is_said_in_a_line(data, tmp_path):
     split = open_split(data, "oven", "val")
     path = predicted(split, tmp_path / "p.safetensors")

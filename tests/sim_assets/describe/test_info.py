@@ -26,6 +26,33 @@ def test_states_in_words():
     assert describe_state(float("nan"), "revolute") == "–"
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("points", lambda a: a.astype(np.float16), "'points': expected dtype float32"),
+        ("points", lambda a: a * np.nan, "'points', sample 0[0][0]: expected a finite number"),
+        ("joint_axis", lambda a: 2 * a, "'joint_axis', sample 0[0]: expected a unit vector"),
+        ("joint_pivot", lambda a: a[:, :, :2], "'joint_pivot': expected shape (4, 1, 3)"),
+        ("camera", None, "expected tensor 'camera', found none"),
+    ],
+)
+def test_tensors_that_no_sample_has_are_damage(name, change, message, tmp_path, capsys):
+    """The manifest and its hashes agree with the shard: whoever wrote it meant it."""
+    arrays = made.sample_arrays("laptop", 4, 16)
+    before = arrays.pop(name)
+    if change is not None:
+        arrays[name] = change(before)
+    made.write_split(tmp_path, "laptop", "test", arrays)
+    with pytest.raises(SystemExit) as ended:
+        main(["info", str(tmp_path)])
+    assert ended.value.code == 1
+    said = capsys.readouterr()
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert "DAMAGED" in said.out
+    assert "all whole" not in said.out
+
+
 def test_a_damaged_split_costs_itself_alone(tmp_path, capsys):
     made.make_data(tmp_path, count=4, train=3, points=16)
     manifest = tmp_path / "laptop/test/manifest.json"
@@ -34,7 +61,11 @@ def test_a_damaged_split_costs_itself_alone(tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["info", str(tmp_path)])
     assert ended.value.code == 1
-    lines = capsys.readouterr().out.splitlines()
+    said = capsys.readouterr()
+    assert said.err.count("\n") == 1
+    assert "found a link" in said.err
+    assert "(1 of 2 splits are damaged)" in said.err
+    lines = said.out.splitlines()
     damaged = [line for line in lines if line.startswith("DAMAGED")]
     assert len(damaged) == 1
     assert "laptop/test/manifest.json: expected a file of its own, found a link" in damaged[0]

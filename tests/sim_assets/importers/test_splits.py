@@ -165,7 +165,7 @@ def test_light(name: str, tmp_path: Path):
         np.testing.assert_allclose(sample["joint_state"], state, atol=1e-5)
     (folder,) = find_splits(tmp_path.with_name(f"{tmp_path.name}-out"))
     described = describe_split(Split(folder))
-    assert described.whole
+    assert described.damage == ""
     assert re.search(r"^  \S.* visible +unknown$", described.text, re.MULTILINE)
     (instance,) = open_split(tmp_path.with_name(f"{tmp_path.name}-out")).manifest.instances
     assert instance.id == f"{name}-train-002"
