@@ -31,7 +31,7 @@ from scapo.paper.vector_neurons import uniform
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gcn3dConfig:
-    """Defaults as published for segmentation, with seven directions a kernel."""
+    """3DGCN, supervised; as published for segmentation, with seven directions a kernel."""
 
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""

@@ -33,7 +33,7 @@ from scapo.geometry.points import MEAN_RADIUS
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IcpConfig(RegistrationConfig):
-    """Defaults as EAP's appendix: 5 training shapes, 60 initial rotations."""
+    """ICP to labelled templates, as EAP's appendix: 5 training shapes, 60 rotations."""
 
     starts: int = 30
     """Of the 60 initial poses at each template, after a few steps on half of the points, those with

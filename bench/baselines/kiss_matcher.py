@@ -40,7 +40,7 @@ LEAST_KEYPOINTS = 10
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KissMatcherConfig(RegistrationConfig):
-    """Registration by KISS-Matcher; all of its radii and bounds follow from the voxel."""
+    """KISS-Matcher to ICP's templates; all of its radii and bounds follow from the voxel."""
 
     voxel: float = 0.03
     """Normalised length (the mean radius is 0.25) that points are thinned to."""

@@ -51,7 +51,7 @@ SMOOTH = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NpcsEpnConfig:
-    """Defaults: constants of the public code of ANCSH, sizes of EPN."""
+    """NPCS on EPN features, supervised; constants of the public code of ANCSH, EPN's sizes."""
 
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""

@@ -35,7 +35,7 @@ ZERO = 1e-9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointNet2Config:
-    """Defaults as published for part segmentation."""
+    """PointNet++, supervised; as published for part segmentation."""
 
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""

@@ -79,7 +79,7 @@ class Evaluate(requests.EvaluateRequest):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tables:
-    """Tables 1, 2 and 3 from scores per sample, the paper's printed numbers beside ours, and ours.
+    """Tables 1 to 7 from scores per sample; 1 to 3 have the paper's printed numbers beside ours.
 
     Table 1 is on single views (clean), 1-complete on whole surfaces, 1b on parts seen alone
     (isolated), 4 has mean errors on sensor data and on further categories, 5 real models, 6 objects

@@ -15,7 +15,7 @@ from scapo.paper.part_search import SearchConfig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScapoConfig:
-    """Everything that can be chosen; the defaults are the paper's values (Sec. 4)."""
+    """SCAPO, the paper's method, without labels; the defaults are its values (Sec. 4)."""
 
     preset: Literal["paper", "literal", "cpu", "complete", "warm"] = "paper"
     """Where the other defaults come from."""

@@ -122,7 +122,7 @@ class SearchConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredConfig(SearchConfig):
-    """Template registration: the template by registration and bundle adjustment."""
+    """Template registration, a method of ours: finds an articulated template without labels."""
 
     discovery: DiscoveryConfig = field(default_factory=DiscoveryConfig)
     """The search for the template."""

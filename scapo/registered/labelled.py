@@ -61,7 +61,7 @@ CHUNK = 64  # Views, and as many times 16 points, that are compared at once
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelledConfig(SearchConfig):
-    """Template registration with the template of true placements."""
+    """A bound: template registration with the template of true placements, all labels."""
 
     trusted: float = 1.0
     """Share of the learned clouds, those that the template explains best, that the network learns

@@ -63,7 +63,7 @@ class LossConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EapConfig:
-    """Everything that can be chosen; the defaults are the published values."""
+    """EAP, without labels; the defaults are the published values."""
 
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""

@@ -86,7 +86,7 @@ class LossConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpAlignConfig:
-    """Everything that can be chosen; the defaults are the published values."""
+    """OP-Align, without labels; the defaults are the published values."""
 
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""
