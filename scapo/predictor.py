@@ -111,10 +111,8 @@ class Predictor:
         centre = None if sensor is None else self._tensor(sensor).expand(*shape, 3).reshape(-1, 3)
         tint = None if color is None else self._tensor(color)
         if tint is not None and tint.shape != cloud.shape:
-            raise ValueError(
-                f"color: expected the shape of points, {tuple(cloud.shape)}, "
-                f"found {tuple(tint.shape)}"
-            )
+            expected, found = tuple(cloud.shape), tuple(tint.shape)
+            raise ValueError(f"color: expected the shape of points, {expected}, found {found}")
         observation = Observation(
             points=cloud.reshape(-1, *cloud.shape[-2:]),
             color=None if tint is None else tint.reshape(-1, *cloud.shape[-2:]),
