@@ -6,71 +6,22 @@ A verb is a frozen dataclass in `bench.cli.verbs` whose fields are the flags, wi
 130 when interrupted.
 """
 
-from __future__ import annotations
-
-import logging
-import sys
-from collections.abc import Sequence
-from importlib.metadata import version
-from typing import Annotated, Any, Union
-
-import tyro
-from rich.console import Console
-from rich.logging import RichHandler
-
-from bench.cli.console import say
-from bench.cli.verbs import VERBS, prepare, train_verb
-from bench.requests import UsageError
-from scapo.interrupt import exit_interrupted
-
-DESCRIPTION = (
-    "Train, predict, score and tabulate methods of articulated pose estimation "
-    "(--version: of which release)."
-)
+# Nothing is imported here: whatever is, an interrupt would find outside of `main`.
 
 
-def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 - made at run time
-    verbs = dict(VERBS)
-    if "train" in words:  # its methods, whose flags are the next level, take seconds to import
-        verbs["train"] = train_verb(preset)
-    commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in verbs.items()]
-    return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: list[str] | tuple[str, ...] | None = None) -> None:
     """Run one verb and end the process."""
-    words, preset = prepare(sys.argv[1:] if arguments is None else arguments)
-    if words == ["--version"]:
-        say(Console(), f"scapo-bench {version('scapo')}")
-        sys.exit(0)
-    console, errors = Console(), Console(stderr=True)
-    logging.basicConfig(
-        format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
-    )
     try:
-        command: Any = tyro.cli(
-            _commands(words[:1], preset),
-            prog="scapo-bench",
-            description=DESCRIPTION,
-            args=words,
-            config=(
-                tyro.conf.OmitSubcommandPrefixes,
-                tyro.conf.CascadeSubcommandArgs,
-            ),
-        )
-        command.run(console)
-    except MemoryError as error:
-        say(errors, f"scapo-bench: expected enough memory, found: {error}")
-        sys.exit(1)
-    except UsageError as error:
-        say(errors, f"scapo-bench: {error}")
-        sys.exit(2)
-    except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
-        say(errors, f"scapo-bench: {error}")
-        sys.exit(1)
-    except KeyboardInterrupt as stop:
-        say(errors, f"scapo-bench: {str(stop) or 'interrupted'}")
-        exit_interrupted()
+        from scapo.interrupt import quit_at_interrupt
+
+        with quit_at_interrupt("scapo-bench"):
+            from bench.cli.program import run
+
+        run(arguments)
+    except KeyboardInterrupt:
+        from scapo.interrupt import exit_interrupted
+
+        exit_interrupted("scapo-bench: interrupted")
 
 
 if __name__ == "__main__":

@@ -10,24 +10,26 @@ the first: data and finished runs stay.
 
 from __future__ import annotations
 
-import csv
-import shutil
-import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from scapo.interrupt import exit_interrupted, quit_at_interrupt
 
-import tyro
-from rich.console import Console
-from rich.table import Table
+with quit_at_interrupt("demo"):  # these take a second
+    import csv
+    import shutil
+    import time
+    from collections.abc import Mapping, Sequence
+    from concurrent.futures import ThreadPoolExecutor
+    from dataclasses import dataclass
+    from pathlib import Path
+    from typing import Literal
 
-from bench.figures.pictures import predictions_picture, training_curve
-from bench.grid.command import Program, StepError, run_command
-from scapo import store
-from scapo.interrupt import exit_interrupted
-from scapo.predictor import find, released
+    import tyro
+    from rich.console import Console
+    from rich.table import Table
+
+    from bench.figures.pictures import predictions_picture, training_curve
+    from bench.grid.command import Program, StepError, run_command
+    from scapo import store
+    from scapo.predictor import find, released
 
 RELEASED = "released"
 CURVED = ("scapo", "registered")
@@ -71,11 +73,11 @@ class Demo:
 
 def main() -> None:
     """Run the demo; exit 1 when a step fails."""
-    demo = tyro.cli(Demo, prog="python -m bench.demo", description=__doc__)
     console = Console(highlight=False)
     started = time.perf_counter()
-    console.print(f"scapo demo: {', '.join(demo.categories)} -> {demo.out}/")
     try:
+        demo = tyro.cli(Demo, prog="python -m bench.demo", description=__doc__)
+        console.print(f"scapo demo: {', '.join(demo.categories)} -> {demo.out}/")
         with ThreadPoolExecutor(AT_ONCE) as pool:
             list(pool.map(lambda name: run_category(demo, name, console), demo.categories))
         table = make_table(demo, console)
@@ -83,8 +85,7 @@ def main() -> None:
         console.print(f"demo: {error}", style="red")
         raise SystemExit(1) from error
     except KeyboardInterrupt:
-        console.print("demo: interrupted; run it again to go on from here")
-        exit_interrupted()
+        exit_interrupted("demo: interrupted; run it again to go on from here")
     console.print(table)
     console.print(closing_words(demo, time.perf_counter() - started), soft_wrap=True)
 

@@ -1,22 +1,51 @@
 # SPDX-License-Identifier: MIT
-"""How a program ends that was interrupted."""
+"""How a program ends that was interrupted. Only the standard library: it is imported first."""
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 INTERRUPTED = 130
 """Exit status of a program ended by Ctrl-C, as a shell reports it: 128 + SIGINT."""
 
 
-def exit_interrupted() -> NoReturn:
-    """End the process as interrupted, after whatever was to be said of it.
+@contextmanager
+def quit_at_interrupt(program: str) -> Iterator[None]:
+    """Within, an interrupt ends the process at once with one line.
+
+    For a program's own imports: there is nothing to tidy up yet, and an interrupt that is raised
+    in one may get lost in a callback or come out as another error. Where interrupts are ignored or
+    somebody else's business, that stays.
+    """
+    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def leave(*_: object) -> None:
+        os.write(2, f"{program}: interrupted\n".encode())
+        os._exit(INTERRUPTED)
+
+    signal.signal(signal.SIGINT, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def exit_interrupted(line: str = "") -> NoReturn:
+    """End the process as interrupted, after a line on stderr if there is one to be said.
 
     CPython notes an interrupt that leaves code given to `exec` as a string, which is how every
     dataclass and named tuple of an import is made, and under `python -m` ends by the signal itself
     whatever exit status is raised later (`exit_sigint` in its Modules/main.c). Code that is
     evaluated afterwards takes the note away.
     """
+    if line:
+        sys.stderr.write(f"{line}\n")
     eval("0")
     sys.exit(INTERRUPTED)

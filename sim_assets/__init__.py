@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # as typing's own, whose import an interrupt would find outside of `main`
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Any
+
     from scapo.categories import Category
     from scapo.types import Sample
 

@@ -6,60 +6,22 @@ A verb is a frozen dataclass in `sim_assets.cli.verbs` whose fields are the flag
 one line, 2 on wrong usage, 130 when interrupted.
 """
 
-from __future__ import annotations
-
-import sys
-from collections.abc import Sequence
-from importlib.metadata import version
-from typing import Annotated, Any, Union
-
-import tyro
-from rich.console import Console
-from rich.text import Text
-
-from scapo.interrupt import exit_interrupted
-from scapo.text import one_line
-from sim_assets.cli.verbs import VERBS, UsageError
-
-DESCRIPTION = (
-    "Make and look at labelled point clouds of articulated objects (--version: of which release)."
-)
+# Nothing is imported here: whatever is, an interrupt would find outside of `main`.
 
 
-def _commands() -> Any:  # noqa: ANN401 - a union made at run time
-    commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in VERBS.items()]
-    return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: list[str] | tuple[str, ...] | None = None) -> None:
     """Run one verb and end the process."""
-    console, errors = Console(), Console(stderr=True)
-    words = sys.argv[1:] if arguments is None else list(arguments)
-    if words == ["--version"]:
-        _say(console, f"scapo-data {version('scapo')}")
-        sys.exit(0)
     try:
-        command: Any = tyro.cli(
-            _commands(),
-            prog="scapo-data",
-            description=DESCRIPTION,
-            args=words,
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
-        sys.exit(command.run(console))
-    except MemoryError as error:
-        _say(errors, f"scapo-data: expected enough memory, found: {error}")
-        sys.exit(1)
-    except (ValueError, OSError, RuntimeError) as error:
-        _say(errors, f"scapo-data: {error}")
-        sys.exit(2 if isinstance(error, UsageError) else 1)
+        from scapo.interrupt import quit_at_interrupt
+
+        with quit_at_interrupt("scapo-data"):
+            from sim_assets.cli.program import run
+
+        run(arguments)
     except KeyboardInterrupt:
-        _say(errors, "scapo-data: stopped; the same command takes it up where it was")
-        exit_interrupted()
+        from scapo.interrupt import exit_interrupted
 
-
-def _say(console: Console, line: str) -> None:
-    console.print(Text(one_line(line)), soft_wrap=True)
+        exit_interrupted("scapo-data: interrupted")
 
 
 if __name__ == "__main__":

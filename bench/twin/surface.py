@@ -5,7 +5,7 @@ The solid is what a ball that rolls over the points from outside cannot reach (a
 H. Edelsbrunner, E. P. Mücke, Three-dimensional alpha shapes, 1994), and no thinner than the grid
 can show. That needs no trust in the normals' sense: a plate that is thinner than its points are
 apart stays a plate, and an object whose back nobody saw stays a shell. Normals only smooth and
-densify the points. The mesh is `manifold3d`'s level set, which is closed by construction.
+densify the points. The mesh is a level set in tetrahedra, closed by construction.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
-from manifold3d import Manifold
-from scipy.ndimage import binary_fill_holes, map_coordinates, maximum_filter
+from manifold3d import Manifold, Mesh64
+from scipy.ndimage import binary_fill_holes, maximum_filter
 from scipy.spatial import KDTree
+
+from bench.twin.level_set import level_set
 
 MAX_FACES = 4000
 MAX_SAMPLES = 4000
@@ -40,8 +42,6 @@ NODES = 150_000
 """Of the grid at most, which is coarser where the part is large."""
 THIN, SOLID = 0.8, 0.2
 """Cells that are added on all sides: to what is thinner than a cell or so, and to the rest."""
-EDGE = 1.2
-"""Edges of the level set's triangles, in cells."""
 COARSER = 1.4
 """Factor on the cells while there are too many faces."""
 DUST = 0.02
@@ -126,7 +126,7 @@ def closed_mesh(samples: Samples) -> trimesh.Trimesh:
     wanted = spacing / FINE
     while True:
         low, count, cell = _grid(dense, REACH * spacing, wanted)
-        made = _level_set(_depth(dense, REACH * spacing, (low, count, cell)))
+        made = _simple(_depth(dense, REACH * spacing, (low, count, cell)))
         if made.num_tri() <= MAX_FACES:
             break
         wanted = COARSER * cell
@@ -193,19 +193,9 @@ def _densified(samples: Samples) -> Samples:
     )
 
 
-def _level_set(depth: Float[np.ndarray, "X Y Z"]) -> Manifold:
+def _simple(depth: Float[np.ndarray, "X Y Z"]) -> Manifold:
     """Where the depth at the nodes is above 0, in cells; without dust, simplified."""
-    bounds = [0.0, 0.0, 0.0, *(np.array(depth.shape) - 1.0)]
-    asked: list[tuple[float, float, float]] = []
-
-    def note(x: float, y: float, z: float) -> float:
-        asked.append((x, y, z))
-        return -1.0
-
-    Manifold.level_set(note, bounds, EDGE)  # where it looks, to be answered all at once
-    values = map_coordinates(depth, np.array(asked).T, order=1, mode="nearest")
-    known = dict(zip(asked, values.tolist(), strict=True))
-    made = _without_dust(Manifold.level_set(lambda x, y, z: known[(x, y, z)], bounds, EDGE))
+    made = _without_dust(Manifold(Mesh64(*level_set(depth))))
     tolerance = 0.05
     simple = made.simplify(tolerance)
     while simple.num_tri() > MAX_FACES and tolerance < 0.5:

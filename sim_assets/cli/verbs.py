@@ -97,7 +97,8 @@ class Check:
     """Say of each model of a folder whether it can be used: accepted, repaired or refused."""
 
     path: tyro.conf.Positional[Path]
-    """Folder of models, searched recursively, or one .urdf file."""
+    """Folder of models, searched recursively, or one .urdf file. URDFs beside a mobility.urdf
+    count as variants of that model: name their file to have one checked."""
     json: Path | None = None
     """File that the results are written to as well."""
     category: NameOfAny | None = None

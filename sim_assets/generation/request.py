@@ -11,6 +11,7 @@ from scapo.categories import Category
 from scapo.categories import category as find_category
 from sim_assets.generation.assets import Asset, folder_assets, procedural_assets
 from sim_assets.generation.plan import Request
+from sim_assets.models.frames import check_wanted
 from sim_assets.options import DataOptions
 from sim_assets.rendering.backends import resolve_backend
 from sim_assets.rendering.base import Backend
@@ -158,7 +159,9 @@ def _check(options: DataOptions) -> None:
             f"count: expected a multiple of states_per_view, {options.states_per_view}, found "
             f"{options.count}"
         )
-    asked = options.up or options.front or options.scale or options.any_model
+    wanted = options.up, options.front, options.scale
+    asked = options.any_model or any(value is not None for value in wanted)
     if options.source == "procedural" and asked:
         names = "up, front, scale, any_model"
         raise ValueError(f"{names}: expected only with a --source folder of models")
+    check_wanted(*wanted)

@@ -21,6 +21,7 @@ from scapo.store.files import write_bytes
 from scapo.text import one_line
 from sim_assets.generation.request import make_settings
 from sim_assets.models.account import check_speaks, sentences
+from sim_assets.models.frames import check_wanted
 from sim_assets.models.joints import Candidate, candidates
 from sim_assets.models.library import find, source_root
 from sim_assets.models.limits import CLOCK_SECONDS, bounded, limited_memory
@@ -75,7 +76,10 @@ class _Model:
     """A job for a worker."""
 
     urdf: Path
+    given: Path
+    """Folder that names are relative to."""
     root: Path
+    """Folder below which files are found: of a package's own folder of URDFs, the package."""
     options: Options
 
 
@@ -99,10 +103,12 @@ def check(
 
     Raises:
         AssetError: No such folder, or no model in it.
+        ValueError: Options by which no model can be read.
     """
     options = options or Options()
-    root = source_root(path)
-    models = [_Model(urdf=urdf, root=root, options=options) for urdf in find(path)]
+    check_wanted(options.up, options.front, options.scale)
+    given, root = path if path.is_dir() else path.parent, source_root(path)
+    models = [_Model(urdf=urdf, given=given, root=root, options=options) for urdf in find(path)]
     results: dict[Path, Result] = {}
     pool: Pool[_Model, Result] = Pool(min(workers, len(models)), timeout=options.timeout)
     with pool:
@@ -146,7 +152,7 @@ def _job(model: _Model, send: Report) -> Result:
 def _result(outcome: Outcome[_Model, Result]) -> Result:
     model = outcome.job
     folder = model.urdf.parent.resolve()  # the file itself may be a link to anywhere
-    name = one_line((folder / model.urdf.name).relative_to(model.root.resolve()).as_posix())
+    name = one_line((folder / model.urdf.name).relative_to(model.given.resolve()).as_posix())
     result = outcome.result
     if result is None:
         reason = f"{name}: expected to be read, found that {outcome.reason}"

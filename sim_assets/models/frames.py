@@ -46,11 +46,34 @@ def direction(name: str, path: Path) -> Vector:
     Raises:
         AssetError: Another word.
     """
-    clean = name.strip().lower()
-    if clean.lstrip("+-") not in AXES or len(clean) > 2:
+    if not _is_direction(name):
         raise refuse(path, "a direction out of x, -x, y, -y, z, -z", repr(name))
-    sign = -1.0 if clean.startswith("-") else 1.0
-    return sign * np.eye(3)[AXES.index(clean[-1])]
+    sign = -1.0 if name.strip().startswith("-") else 1.0
+    return sign * np.eye(3)[AXES.index(_letter(name))]
+
+
+def check_wanted(up: str | None, front: str | None, scale: float | None) -> None:
+    """Refuse what no model can be read by, before any is.
+
+    Raises:
+        ValueError: `up`, `front` or `scale`: expected, found.
+    """
+    for name, word in (("up", up), ("front", front)):
+        if word is not None and not _is_direction(word):
+            raise ValueError(f"{name}: expected x, -x, y, -y, z or -z, found {word!r}")
+    if up is not None and front is not None and _letter(up) == _letter(front):
+        raise ValueError(f"front: expected an axis at right angles to up, {up}, found {front}")
+    if scale is not None and not 0 < scale < np.inf:
+        raise ValueError(f"scale: expected a finite number above 0, found {scale}")
+
+
+def _is_direction(word: str) -> bool:
+    clean = word.strip().lower()
+    return clean.lstrip("+-") in AXES and len(clean) <= 2
+
+
+def _letter(word: str) -> str:
+    return word.strip().lower()[-1]
 
 
 def name_of(vector: Vector) -> str:

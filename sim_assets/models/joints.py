@@ -47,6 +47,8 @@ LONGEST = {"revolute": 4 * pi, "prismatic": 3.0}
 """rad; asset diagonals."""
 SHORTEST = {"revolute": radians(5.0), "prismatic": 0.01}
 """rad; asset diagonals. Knobs and buttons travel less."""
+MAX_CORNERS = 2048
+"""Of a part's convex hull, of which more are thinned where rest is searched."""
 MAX_PRODUCTS = 1 << 25
 """Numbers that are computed at once: a quarter of a gigabyte."""
 MAX_PAIRED = 16
@@ -341,7 +343,10 @@ class _Scene:
                 for name in sorted(part & set(surfaces))
                 for visual in surfaces[name]
             ]
-            self.points.append(hull_points(np.concatenate(pieces)))
+            corners = hull_points(np.concatenate(pieces))
+            if len(corners) > MAX_CORNERS:  # a sphere, whose hull takes long at each position
+                corners = outermost(corners)
+            self.points.append(corners)
             self.base_T_part.append(base_T_root @ poses[head])
         self.zero = [wanted[joint.name] for joint in reduction.joints]
 
@@ -424,11 +429,16 @@ def hull_points(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
     try:
         return points[ConvexHull(points).vertices]
     except QhullError:
-        k = np.arange(1024) + 0.5
-        z, turn = 1 - 2 * k / 1024, pi * (1 + 5**0.5) * k
-        ring = np.sqrt(1 - z * z)
-        directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
-        return points[farthest(points, directions.T)]
+        return outermost(points)
+
+
+def outermost(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "M 3"]:
+    """Those that lie farthest along some of 1024 directions, spread evenly over the sphere."""
+    k = np.arange(1024) + 0.5
+    z, turn = 1 - 2 * k / 1024, pi * (1 + 5**0.5) * k
+    ring = np.sqrt(1 - z * z)
+    directions = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], 1)
+    return points[farthest(points, directions.T)]
 
 
 def farthest(

@@ -237,7 +237,7 @@ def _joint(reader: _Reader, element: Element, name: str) -> Joint:
         if end is None:
             raise reader.error(where, f"a <{role}>", "none")
         ends[role] = reader.name(end, "link", where)
-    lower, upper = _limits(reader, element, kind, where)
+    lower, upper, unlimited = _limits(reader, element, kind, where)
     return Joint(
         name=name,
         kind=cast("Kind", kind),
@@ -247,6 +247,7 @@ def _joint(reader: _Reader, element: Element, name: str) -> Joint:
         axis=_axis(reader, element, kind, where),
         lower=lower,
         upper=upper,
+        unlimited=unlimited,
         mimic=_mimic(reader, element, kind, where),
     )
 
@@ -269,22 +270,22 @@ def _axis(reader: _Reader, element: Element, kind: str, where: str) -> Float[np.
 
 def _limits(
     reader: _Reader, element: Element, kind: str, where: str
-) -> tuple[float | None, float | None]:
-    """Lower and upper, 0 where only one is given (URDF's default); None where not numbers."""
+) -> tuple[float | None, float | None, str]:
+    """Lower and upper, 0 where only one is given (URDF's default); or None and what there is."""
     if kind not in ("revolute", "prismatic"):
-        return None, None
+        return None, None, "none"
     found = reader.first(element, "limit", where)
     if found is None or (found.get("lower") is None and found.get("upper") is None):
-        return None, None
+        return None, None, "none"
     texts = found.get("lower", "0"), found.get("upper", "0")
     if any(text.strip().lower().lstrip("+-") in ("nan", "inf", "infinity") for text in texts):
-        return None, None
+        return None, None, "from {} to {}".format(*texts)
     lower, upper = (reader.one(text, f"{where} limit") for text in texts)
     if lower > upper:
         reader.repairs.add("Limits in the wrong order were exchanged", where)
         lower, upper = upper, lower
     # Adding 0 turns -0.0 into 0.0.
-    return lower + 0.0, upper + 0.0
+    return lower + 0.0, upper + 0.0, ""
 
 
 def _mimic(reader: _Reader, element: Element, kind: str, where: str) -> Mimic | None:

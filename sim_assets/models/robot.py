@@ -68,6 +68,8 @@ class Joint:
     lower: float | None = None
     """rad or asset units; None where the file gives no `<limit>`, or none that is a number."""
     upper: float | None = None
+    unlimited: str = "none"
+    """What the file gives in place of limits, where they are None."""
     mimic: Mimic | None = None
 
     def clamp(self, position: float) -> float:

@@ -200,7 +200,7 @@ def check_movable(path: Path, joint: Joint, sizes: Float[np.ndarray, " 2"]) -> N
     if joint.kind == "continuous":
         return
     if joint.lower is None or joint.upper is None:
-        raise refuse(path, f"limits of the {joint.kind} joint {joint.name!r}", "none")
+        raise refuse(path, f"limits of the {joint.kind} joint {joint.name!r}", joint.unlimited)
     span = joint.upper - joint.lower
     where = f"joint {joint.name!r} from {joint.lower:g} to {joint.upper:g}"
     if not np.isfinite(span):

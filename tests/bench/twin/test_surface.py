@@ -51,6 +51,20 @@ def test_a_plate_far_thinner_than_its_points_are_apart_has_no_holes():
     assert mesh.contains(middle).all()
 
 
+@pytest.mark.parametrize("count", [1000, 4000])
+def test_a_large_thin_plate_is_closed(count: int):
+    """Its surface is large for its grid, by which `manifold3d.Manifold.level_set` crashed."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (count, 3)) * [0.9, 0.6, 0.0]
+    points[:, 2] = rng.normal(0, 0.002, count)
+    mesh = closed_mesh(seen_samples(points, np.array([0.0, 0.0, 5.0])))
+    check_closed(mesh)
+    assert mesh.extents == pytest.approx([0.9, 0.6, 0.0], abs=0.06)
+    assert farthest(mesh, points[::7]) < 0.04
+    middle = np.column_stack([points[::50, :2] * 0.9, np.zeros(count // 50)])
+    assert mesh.contains(middle).mean() > 0.9
+
+
 def test_the_sense_of_normals_does_not_matter():
     samples = box_samples((0.4, 0.5, 0.6))
     flip = np.random.default_rng(0).choice([-1.0, 1.0], (len(samples.points), 1))

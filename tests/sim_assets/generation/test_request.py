@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +34,14 @@ def test_options_out_of_range_are_refused():
         ({"states_per_view": 4}, "count: expected a multiple of states_per_view, 4, found 30"),
         ({"image_size": 5000}, "image_size: expected 4096 or less, found 5000"),
         ({"up": "z"}, "expected only with a --source folder"),
+        ({"scale": 0.0}, "expected only with a --source folder"),
+        (
+            {"source": "any", "scale": math.nan},
+            "scale: expected a finite number above 0, found nan",
+        ),
+        ({"source": "any", "scale": 0.0}, "scale: expected a finite number above 0, found 0.0"),
+        ({"source": "any", "up": "q"}, "up: expected x, -x, y, -y, z or -z, found 'q'"),
+        ({"source": "any", "up": "z", "front": "-Z"}, "front: expected an axis at right angles"),
         ({"source": "/nowhere/at/all"}, "/nowhere/at/all: expected a folder"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,6 +84,34 @@ def test_a_model_that_hangs_or_eats_the_memory(tmp_path: Path):
     starved = check(tmp_path, Options(memory=16 << 20))
     assert [r.status for r in starved] == ["refused"]
     assert "Memory" in starved[0].reason or "process" in starved[0].reason
+
+
+def test_a_packages_folder_of_urdfs_is_what_paths_are_relative_to(tmp_path: Path):
+    """Meshes are found in the package all the same."""
+    package = cabinet(tmp_path / "cabinet").parent
+    (package / "urdf").mkdir()
+    text = (package / "cabinet.urdf").read_text().replace("meshes/", "package://cabinet/meshes/")
+    (package / "cabinet.urdf").unlink()
+    (package / "urdf/cabinet.urdf").write_text(text)
+    (result,) = check(package / "urdf")
+    assert (result.path, result.status) == ("cabinet.urdf", "accepted"), result.reason
+    assert check(package)[0].path == "urdf/cabinet.urdf"
+    assert check(package / "urdf/cabinet.urdf")[0].path == "cabinet.urdf"
+
+
+@pytest.mark.parametrize("wrong", [{"scale": 0.0}, {"up": "q"}, {"up": "z", "front": "z"}])
+def test_options_that_fit_no_model_are_refused_once(tmp_path: Path, wrong: dict[str, Any]):
+    cabinet(tmp_path / "one")
+    cabinet(tmp_path / "two")
+    with pytest.raises(ValueError, match=f"^{list(wrong)[-1]}: expected .*, found"):
+        check(tmp_path, Options(category="safe", **wrong))
+
+
+def test_variants_beside_mobility_urdf_are_no_models_of_their_own(tmp_path: Path):
+    text = cabinet(tmp_path).read_text()
+    (tmp_path / "mobility.urdf").write_text(text)
+    assert [result.path for result in check(tmp_path)] == ["mobility.urdf"]
+    assert [result.path for result in check(tmp_path / "cabinet.urdf")] == ["cabinet.urdf"]
 
 
 def test_no_folder(tmp_path: Path):

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+"""The words of a `scapo-bench` command to its verb, and errors to one line."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated, Any, Union
+
+import tyro
+from rich.console import Console
+from rich.logging import RichHandler
+
+from bench.cli.console import say
+from bench.cli.verbs import VERBS, prepare, train_verb
+from bench.requests import UsageError
+from scapo.interrupt import exit_interrupted
+
+DESCRIPTION = (
+    "Train, predict, score and tabulate methods of articulated pose estimation "
+    "(--version: of which release)."
+)
+
+
+def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 - made at run time
+    verbs = dict(VERBS)
+    if "train" in words:  # its methods, whose flags are the next level, take seconds to import
+        verbs["train"] = train_verb(preset)
+    commands = [Annotated[verb, tyro.conf.subcommand(name)] for name, verb in verbs.items()]
+    return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
+
+
+def run(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb; other ends than success by `SystemExit`."""
+    words, preset = prepare(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:
+        say(Console(), f"scapo-bench {version('scapo')}")
+        sys.exit(0)
+    console, errors = Console(), Console(stderr=True)
+    logging.basicConfig(
+        format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
+    )
+    try:
+        command: Any = tyro.cli(
+            _commands(words[:1], preset),
+            prog="scapo-bench",
+            description=DESCRIPTION,
+            args=words,
+            config=(
+                tyro.conf.OmitSubcommandPrefixes,
+                tyro.conf.CascadeSubcommandArgs,
+            ),
+        )
+        command.run(console)
+    except MemoryError as error:
+        say(errors, f"scapo-bench: expected enough memory, found: {error}")
+        sys.exit(1)
+    except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+        say(errors, f"scapo-bench: {error}")
+        sys.exit(2 if isinstance(error, UsageError) else 1)
+    except KeyboardInterrupt as stop:
+        say(errors, f"scapo-bench: {str(stop) or 'interrupted'}")
+        exit_interrupted()
