@@ -57,9 +57,6 @@ class DiscoveryConfig(TemplateConfig):
     """First templates that enter the rungs, those that explain the held-out views best."""
     dense_rounds: int = 4
     """Of building the dense template and fitting it, 5 s each: axes settle in them."""
-    polished: int = 160
-    """Views, the surest of all, that it is built anew from at the end, where that explains held-out
-    views better; 0: none."""
     heats: tuple[float, ...] = (0.4, 0.55)
     """Share of inliers in each rung of these, on half of the views; then the best goes on alone."""
     judged: int = 48
@@ -142,7 +139,7 @@ def quick_config() -> RegisteredConfig:
     discovery = DiscoveryConfig(
         seeds=32, searched=48, trusted=(0.6, 0.85), starts=2, draws=2, objects=8, object_views=12,
         contenders=1, heats=(), judged=16, mirror=False, leans=False, final_points=800,
-        dense_rounds=1, polished=0,
+        dense_rounds=1,
     )  # fmt: skip
     return RegisteredConfig(preset="quick", discovery=discovery, learned=120, epochs=20)
 

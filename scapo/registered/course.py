@@ -74,10 +74,6 @@ def plan_of(
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION
     plan["search of all views"] = VIEW * views
-    if config.polished:
-        plan["template of all views"] = DENSE * config.dense_rounds
-        plan["judging the template of all views"] = 2 * judged
-        plan["second search"] = VIEW * views
     return plan
 
 

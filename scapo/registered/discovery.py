@@ -26,7 +26,7 @@ from scapo.categories import JointKind
 from scapo.method import Journal, evenly
 from scapo.records import take
 from scapo.registered.axis_deviation import with_axis_deviation
-from scapo.registered.bundle_adjustment import Candidate, Inliers, densified, refit
+from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.course import JUDGES, Course, numbered, plan_of
 from scapo.registered.initialisation import common_frame, fitted_proposals
@@ -43,7 +43,6 @@ from scapo.registered.pose_search import (
     Searched,
     SearchResult,
     find_inliers,
-    most_confident,
     search_views,
     unexplained,
 )
@@ -53,8 +52,6 @@ from scapo.registered.views import PartialViews
 logger = logging.getLogger(__name__)
 
 STRIDE = 3  # Views by which the draws are apart
-SURE = 0.7  # Share of all views that a template may be built anew from, the most confident
-WORTH = 0.01  # Share of the held-out loss that this must save
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,58 +102,13 @@ def discover(
     for name, share in zip(rounds, shares, strict=True):
         best = course.step(name, partial(advance, best, searched, share, config, generator))
         logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
-    return _finished(best, views, judges, config, course)
-
-
-def _finished(
-    best: Candidate,
-    views: PartialViews,
-    judges: PartialViews,
-    config: DiscoveryConfig,
-    course: Course,
-) -> Discovery:
-    """The dense template of the candidate, and all views searched with it."""
-    generator, kinds = course.generator, best.template.kinds
     dense = partial(densified, best, config, generator, config.dense_rounds)
     best = course.step("dense template", dense)
     if config.leans and "revolute" in kinds:
         deviating = partial(with_axis_deviation, best, judges, config, generator)
         best = course.step("deviating axes", deviating)
     found = course.step("search of all views", partial(search_views, best, views, config))
-    if config.polished:
-        again = partial(built_again, best, views, found, config, generator)
-        built = course.step("template of all views", again)
-        judging = partial(_losses, [best, built], judges, config)
-        before, after = course.step("judging the template of all views", judging)
-        if after < (1 - WORTH) * before:
-            best = built
-            found = course.step("second search", partial(search_views, best, views, config))
     return Discovery(template=best.template, found=found)
-
-
-def built_again(
-    candidate: Candidate,
-    views: PartialViews,
-    found: SearchResult,
-    config: DiscoveryConfig,
-    generator: torch.Generator,
-) -> Candidate:
-    """The candidate with its template built anew from the surest views as it places them.
-
-    The dense template was built from the inliers of the last round, placed by a sparse one. Where
-    its parts end is told better by more views and by placements of its own.
-
-    Args:
-        candidate: With the dense template, which stays as it is.
-        views: All.
-        found: Their placements by it.
-        config: How many views, and in how many rounds.
-        generator: Draws points.
-    """
-    sure = most_confident(found, SURE)[: config.polished]
-    inliers = Inliers(views=take(views, sure), placement=take(found.placement, sure))
-    start = replace(candidate, inliers=inliers)
-    return densified(start, config, generator, config.dense_rounds)
 
 
 def held_out(views: PartialViews, count: int) -> tuple[PartialViews, PartialViews]:
@@ -241,17 +193,10 @@ def ranked(tried: list[Candidate], judges: PartialViews, config: DiscoveryConfig
     """The candidates by how well they explain the held-out views, the best first."""
     if len(tried) == 1:
         return [0]
-    losses = _losses(tried, judges, config)
-    return sorted(range(len(tried)), key=losses.__getitem__)
-
-
-def _losses(
-    tried: Sequence[Candidate], judges: PartialViews, config: DiscoveryConfig
-) -> list[float]:
-    """What held-out views cost the candidates."""
     losses = [unexplained(one, judges, config) for one in tried]
-    logger.info("templates judged: %s", " ".join(f"{x:.3f}" for x in losses))
-    return losses
+    order = sorted(range(len(tried)), key=losses.__getitem__)
+    logger.info("templates judged: %s; best: %s", " ".join(f"{x:.3f}" for x in losses), order)
+    return order
 
 
 def advance(
@@ -309,7 +254,7 @@ def _dense_losses(
     generator: torch.Generator,
 ) -> list[float]:
     """What held-out views cost the candidates with dense templates."""
-    return _losses([densified(one, config, generator) for one in tried], judges, config)
+    return [unexplained(densified(one, config, generator), judges, config) for one in tried]
 
 
 @torch.no_grad()

@@ -105,42 +105,6 @@ def test_mirror_images_take_the_first_round_on_half_of_the_views(
         assert calls == wanted
 
 
-@pytest.mark.parametrize(("cost", "taken"), [(0.9, True), (0.995, False), (1.2, False)])
-def test_a_template_of_all_views_is_taken_where_held_out_views_cost_less(
-    monkeypatch: pytest.MonkeyPatch, cost: float, taken: bool
-) -> None:
-    """The surest 70 % of the views are built from, and all are searched again where it is taken."""
-    views, truth = sighted(16, seed=1)
-    first = Candidate(template=template(), inliers=Inliers(views=views, placement=truth))
-    anew = replace(first, template=template())
-    sure = torch.arange(16).flip(0).float()
-    everywhere = SearchResult(placement=truth, loss=torch.zeros(16), margin=sure)
-    searched: list[Candidate] = []
-
-    def searching(one: Candidate, *_: object) -> SearchResult:
-        searched.append(one)
-        return everywhere
-
-    def building(one: Candidate, *_: object) -> Candidate:
-        if len(one.inliers.views.points) == 16:
-            return one
-        assert torch.equal(one.inliers.views.points, views.points[:11])
-        return anew
-
-    for name, step in {
-        "_best": lambda *_: first,
-        "densified": building,
-        "search_views": searching,
-        "unexplained": lambda one, *_: 0.2 * (cost if one is anew else 1.0),
-    }.items():
-        monkeypatch.setattr(discovery, name, step)
-    monkeypatch.setattr(discovery, "_of_draws", lambda *_: [first])
-    config = DiscoveryConfig(mirror=False, trusted=(), leans=False)
-    found = discovery.discover(views, ("revolute",), config, generator(0))
-    assert (found.template is anew.template) == taken
-    assert searched == ([first, anew] if taken else [first])
-
-
 def without_a_side() -> ArticulatedTemplate:
     """The box with its flap, but without its side at positive y."""
     whole = template(count=500)
