@@ -124,6 +124,19 @@ def test_somebody_who_writes_meanwhile_is_not_overwritten(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+def write_half(folder: Path, error: type[BaseException]) -> None:
+    with whole_folder(folder) as place:
+        (place / "half").write_text("half")
+        raise error
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_what_fails_leaves_nothing_behind(tmp_path: Path, error: type[BaseException]):
+    with pytest.raises(error):
+        write_half(tmp_path / "out", error)
+    assert list(tmp_path.iterdir()) == []  # hidden ones neither
+
+
 def test_digests_tell_kinds_apart(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
