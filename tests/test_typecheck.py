@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 import torch
 from jaxtyping import Float, TypeCheckError, jaxtyped
 from torch import Tensor
 
 from scapo.geometry.rigid import apply
+from tests.helpers import typecheck
 from tests.helpers.typecheck import CALLS, CURRENT, checked
 
 
@@ -39,3 +43,20 @@ def test_the_first_calls_of_every_test_are_checked(monkeypatch: pytest.MonkeyPat
         for _ in range(CALLS):
             rows(torch.zeros(5, 3))
         rows(torch.zeros(5, 4))
+
+
+def test_a_call_in_the_middle_of_the_building_of_checks_does_not_wait(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As that of a signal's handler, which comes while beartype holds its locks."""
+    build, handled = typecheck._strict, list[bool]()
+
+    def building(function: Callable[..., Any]) -> Callable[..., Any]:
+        handled.append(checked(rows)(torch.zeros(5, 4)) is None)
+        return build(function)
+
+    monkeypatch.setattr(typecheck, "_strict", building)
+    outer = checked(rows)
+    with pytest.raises(TypeCheckError):
+        outer(torch.zeros(5, 4))
+    assert handled == [True]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from threading import Lock
 from typing import Any
 
 import torch
@@ -18,6 +19,8 @@ from beartype import BeartypeConf, beartype
 CALLS = 100
 CURRENT = "PYTEST_CURRENT_TEST"
 """Set by pytest: the test, and whether it is its setup, its call or its teardown."""
+_building = Lock()
+"""Held while checks are built: beartype has locks that wait for themselves."""
 _strict = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int is a float, as for pyright
 
 
@@ -40,7 +43,12 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
         if calls > CALLS:
             return None
         if strict is None:
-            strict = _strict(function)
+            if not _building.acquire(blocking=False):
+                return None  # a handler of signals, called while another's checks are built
+            try:
+                strict = _strict(function)
+            finally:
+                _building.release()
         return strict(*args, **kwargs)
 
     return check
