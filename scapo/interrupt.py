@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
@@ -20,9 +21,10 @@ def quit_at_interrupt(program: str) -> Iterator[None]:
 
     For a program's own imports: there is nothing to tidy up yet, and an interrupt that is raised
     in one may get lost in a callback or come out as another error. Where interrupts are ignored or
-    somebody else's business, that stays.
+    somebody else's business, as in another thread than the main one, that stays.
     """
-    if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return
 

@@ -77,7 +77,8 @@ def _text(name: str) -> str:
 
 def _lead(twin: Twin) -> str:
     points = f"{len(twin.points):,} observed points"
-    model = ", ".join(f"{name} {text[:DIGEST]}" for name, text in twin.model.items())
+    short = {"sha256": twin.model["sha256"][:DIGEST]} if "sha256" in twin.model else {}
+    model = ", ".join(f"{name} {text}" for name, text in {**twin.model, **short}.items())
     return f"{points}; model: {model}" if model else points
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+
+from scapo.interrupt import quit_at_interrupt
 
 # As a module that is run by `python -m`; `exec` of a string is how dataclasses are made.
 PROGRAM = """
@@ -31,3 +34,14 @@ def test_status_of_an_interrupted_module(tmp_path: Path, raised: str) -> None:
         check=False,
     )
     assert (ended.returncode, ended.stderr) == (130, "")
+
+
+def test_a_program_may_begin_in_another_thread() -> None:
+    """Where signals are none of its business."""
+
+    def begin() -> str:
+        with quit_at_interrupt("program"):
+            return "begun"
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(begin).result() == "begun"

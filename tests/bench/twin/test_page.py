@@ -56,6 +56,12 @@ def download(page: str, name: str) -> bytes:
     return base64.b64decode(found[1])
 
 
+def test_the_model_is_named_whole_and_its_digest_in_short(twin: Twin, tmp_path: Path):
+    model = {"name": "oven", "method": "registered-labelled", "sha256": "0123456789abcdef" * 4}
+    page = write_page(replace(twin, model=model), tmp_path / "page.html").read_text()
+    assert "model: name oven, method registered-labelled, sha256 0123456789ab<" in page
+
+
 def test_it_carries_the_numbers_and_the_files(folder: Path, tmp_path: Path):
     page = (folder / "page.html").read_text()
     for words in ("34.4°", "85.9°", "87% within 5°", "64% within 10°", "0.0123", "registered"):
