@@ -74,6 +74,8 @@ class Chain:
     """Of the method's configuration."""
     seed: int
     steps: tuple[Step, ...]
+    start: str = ""
+    """Label of what is trained, and scored, on the way."""
 
     @property
     def name(self) -> str:
@@ -175,46 +177,47 @@ class _Maker:
 
     def chain(self, entry: Entry, part: str, category: str, seed: int) -> Chain:
         """Training, then for each mode the frames and every split that is scored."""
-        place, name = f"{part}/{category}", f"{category}-{entry.label}-seed{seed}"
-        clouds = self.count(f"{place}/train")
-        trained = list(self.trainings(entry, place, name, seed))
+        place = f"{part}/{category}"
+        trained = list(self.trainings(entry, place, seed))
         steps = [step for step, _ in trained]
         costs = {step.name: cost for step, cost in trained}
         scored = [f"{place}/{split}" for split in self.preset.splits
                   if part != "isolated" or split != "test-ood"]  # fmt: skip
         if self.preset.sizes is None and "test" in self.preset.splits and self.has_real(place):
             scored.append(f"real/{category}/test")
-        for mode in entry.modes:
-            for step, clouds in self.of_mode(entry, mode, place, name, scored):
-                steps.append(step)
-                read = step.kind != "predict"
-                each = SCORING / 1000 if read else entry.seconds.get(mode, 0.0)
-                costs[step.name] = START + clouds * each
+        for one in (entry,) if entry.start is None else (entry.start, entry):
+            for mode in one.modes:
+                for found, clouds in self.of_mode(one, mode, place, seed, scored):
+                    step = found if one is entry else of_start(found)
+                    steps.append(step)
+                    read = step.kind != "predict"
+                    each = SCORING / 1000 if read else one.seconds.get(mode, 0.0)
+                    costs[step.name] = START + clouds * each
         chain = Chain(part=part, category=category, label=entry.label, seed=seed,
-                      steps=tuple(steps))  # fmt: skip
+                      steps=tuple(steps),
+                      start="" if entry.start is None else entry.start.label)  # fmt: skip
         self.seconds |= {(chain.name, step): cost for step, cost in costs.items()}
         return chain
 
-    def trainings(
-        self, entry: Entry, place: str, name: str, seed: int
-    ) -> Iterator[tuple[Step, float | None]]:
+    def trainings(self, entry: Entry, place: str, seed: int) -> Iterator[tuple[Step, float | None]]:
         """The training, after the one that it starts from, with their estimates."""
-        step, cost = self.training(entry, place, name, seed)
+        step, cost = self.training(entry, place, seed)
         config = self.made[entry.label]
         if entry.start is not None:
-            first, its = self.training(entry.start, place, f"{name}-start", seed)
+            first, its = self.training(entry.start, place, seed)
             config = {**config, "start": self.made[entry.start.label]}
-            yield replace(first, name="start"), its
+            yield of_start(first), its
             run = Path(first.output).parent
-            step = replace(step, needs=("start",),
+            step = replace(step, needs=(of_start(first).name,),
                            command=(*step.command, "--start", f"{{out}}/{run}"))  # fmt: skip
         self.configs.setdefault(entry.label, config)
         yield step, cost
 
-    def training(self, entry: Entry, place: str, name: str, seed: int) -> tuple[Step, float | None]:
-        """The training of an entry into the run folder of that name, and its estimate."""
+    def training(self, entry: Entry, place: str, seed: int) -> tuple[Step, float | None]:
+        """The training of an entry into a run folder of its own, and its estimate."""
         part, category = place.split("/")
-        clouds, folder = self.count(f"{place}/train"), f"runs/{part}/{name}"
+        clouds = self.count(f"{place}/train")
+        folder = f"runs/{part}/{name_of(entry, category, seed)}"
         preset, default = own_preset(entry.method, self.grid, entry.preset)
         flags = flags_of(entry, preset, self.preset.budget, clouds)
         step = Step(
@@ -228,10 +231,11 @@ class _Maker:
         return step, training_seconds(entry, flags, clouds)
 
     def of_mode(
-        self, entry: Entry, mode: Mode, place: str, name: str, scored: Sequence[str]
+        self, entry: Entry, mode: Mode, place: str, seed: int, scored: Sequence[str]
     ) -> Iterator[tuple[Step, int]]:
         """Predictions and scores of one mode, with the number of clouds of each step."""
-        part, frames = place.partition("/")[0], ""
+        (part, category), frames = place.split("/"), ""
+        name = name_of(entry, category, seed)
         if "pose" not in METHODS[entry.method].supervision:
             frames = f"predict-{mode}-train"
             limit = self.preset.calibration
@@ -240,7 +244,7 @@ class _Maker:
             clouds = self.count(split)
             predicted = self._predict(split, mode, part, name)
             yield predicted, clouds
-            looked = LOOKED_AT if name.endswith("seed1") and split.endswith("/test") else SCORED
+            looked = LOOKED_AT if seed == 1 and split.endswith("/test") else SCORED
             for kind in looked:
                 yield self._about(kind, predicted, split, frames), clouds
 
@@ -295,6 +299,18 @@ class _Maker:
         return self.counts[split]
 
 
+def name_of(entry: Entry, category: str, seed: int) -> str:
+    """Of a run and of all files about it."""
+    return f"{category}-{entry.label}-seed{seed}"
+
+
+def of_start(step: Step) -> Step:
+    """A step about what a chain starts from, beside the chain's own of the same name."""
+    return replace(
+        step, name=f"{step.name}-start", needs=tuple(f"{one}-start" for one in step.needs)
+    )
+
+
 def own_preset(method: str, name: PresetName, own: str = "") -> tuple[str | None, Any]:
     """A method's preset, the one that goes with a grid's if none is named; its options.
 
@@ -330,11 +346,12 @@ def chosen(chains: Sequence[Chain], only: Sequence[str]) -> list[Chain]:
         patterns = item.split("/")
         fitting = [
             chain.name for chain in chains
-            if all(any(fnmatchcase(word, one) for word in chain.name.split("/"))
+            if all(any(fnmatchcase(word, one) for word in (*chain.name.split("/"), chain.start))
                    for one in patterns)
         ]  # fmt: skip
         if not fitting:
-            labels = ", ".join(dict.fromkeys(chain.label for chain in chains))
+            known = [label for chain in chains for label in (chain.start, chain.label) if label]
+            labels = ", ".join(dict.fromkeys(known))
             parts = ", ".join(dict.fromkeys(chain.part for chain in chains))
             raise ValueError(
                 f"only: expected parts ({parts}), categories, methods ({labels}), seed1, ... or "

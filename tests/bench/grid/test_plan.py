@@ -49,11 +49,20 @@ def test_a_warm_start_has_a_run_of_its_own_to_begin_at(cpu: Plan):
     out = first.command[first.command.index("--out") + 1]
     assert second.command[second.command.index("--start") + 1] == out
     assert first.output == out.removeprefix("{out}/") + "/checkpoint.safetensors"
-    assert second.needs == ("start",)
+    assert second.needs == (first.name,)
     config = cpu.configs["scapo-warm"]
     assert config["config"]["part_start"] == "run"
     assert config["start"]["method"] == "registered"
-    assert cpu.seconds[chain.name, "start"] == 1200
+    assert cpu.seconds[chain.name, first.name] == 1200
+    run = Path(first.output).parent.name
+    told = [s for s in chain.steps if s.name.endswith("-start") and s.kind == "predict"]
+    assert {s.command[1].rpartition("/")[2] for s in told} == {run}
+    assert {s.command[s.command.index("--mode") + 1] for s in told} == {"fast", "quick", "refine"}
+    own = [s for s in chain.steps if s.kind == "predict" and s not in told]
+    assert all(run not in s.command[1] and s.needs == ("train",) for s in own)
+    assert chain in chosen(cpu.chains, ["registered-objects"])
+    assert chain in chosen(cpu.chains, ["scapo-warm"])
+    assert all("registered-objects" in c.start for c in chosen(cpu.chains, ["*objects"]))
 
 
 def test_every_output_is_made_once_and_every_need_is_met_before(cpu: Plan):
