@@ -32,7 +32,7 @@ BAR, EDGE, BEST, PLAIN = "#4477aa", "#222222", "#cc3311", "#bbbbbb"
 
 
 def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
-    """A row per metric, a column per factor; bars with 95 % intervals, the count below each."""
+    """A row per metric, a column per factor; bars with 95 % intervals and numbers of values."""
     metrics = [key for key in LABELS if any((s.metric, s.unit) == key for s in strata)]
     names = [name for name in FACTORS if any(s.factor == name for s in strata)]
     height = 2.3 * len(metrics) + 0.8
@@ -48,12 +48,13 @@ def plot_strata(strata: Sequence[Stratum], title: str) -> bytes:
             _bars(
                 axes,
                 [s.value for s in bins],
-                [f"{s.lower:.3g} to\n{s.upper:.3g}\nn={s.samples}" for s in bins],
+                [f"{s.lower:.2g} to\n{s.upper:.2g}\nn={s.value.count}" for s in bins],
             )
             if column == 0:
                 axes.set_ylabel(LABELS[key])
             if row == 0:
                 axes.set_title(FACTORS[name], fontsize=9)
+        grid[row][0].set_ylim(bottom=0)  # of the whole row, once all its bars are there
     return _png(figure, title)
 
 
@@ -76,6 +77,7 @@ def plot_ladder(ladder: Ladder, title: str) -> bytes:
         if values["predicted"].count:
             axes.axhline(values["predicted"].mean, color=EDGE, linewidth=0.7, linestyle=":")
         axes.set_title(LABELS[key], fontsize=9)
+        axes.set_ylim(bottom=0)
     return _png(figure, f"{title}: one piece replaced by the truth")
 
 
@@ -109,7 +111,6 @@ def _bars(
     axes.tick_params(axis="y", labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(y=0.1)
-    axes.set_ylim(bottom=0)
 
 
 def _png(figure: Figure, title: str) -> bytes:
