@@ -98,7 +98,7 @@ def with_axis_deviation(
     if len(tried) == 1:
         return start
     limits = limits_of(inliers.placement.state, template.kinds)
-    found = search_views(start, judges, config)
+    found = search_views(start, judges)
     placed = refine_states(template, judges, found, limits)
     loss = torch.stack([refine_deviations(one.template, judges, placed)[1] for one in tried])
     least = loss.amin(0)

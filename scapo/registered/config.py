@@ -51,6 +51,10 @@ class DiscoveryConfig(TemplateConfig):
     """Objects of which views are registered with one another."""
     object_views: int = 20
     """Views of each of them."""
+    further_objects: int = 36
+    """Objects beside them that show how objects of the category stand."""
+    further_views: int = 10
+    """Views of each of these."""
     contenders: int = 2
     """First templates of each draw, those of least loss, that held-out views judge."""
     finalists: int = 3
@@ -138,8 +142,8 @@ def quick_config() -> RegisteredConfig:
     """For trying things: trains one category in less than two minutes on two cores."""
     discovery = DiscoveryConfig(
         seeds=32, searched=48, trusted=(0.6, 0.85), starts=2, draws=2, objects=8, object_views=12,
-        contenders=1, heats=(), judged=16, mirror=False, leans=False, final_points=800,
-        dense_rounds=1,
+        further_objects=8, further_views=8, contenders=1, heats=(), judged=16, mirror=False,
+        leans=False, final_points=800, dense_rounds=1,
     )  # fmt: skip
     return RegisteredConfig(preset="quick", discovery=discovery, learned=120, epochs=20)
 

@@ -22,8 +22,9 @@ from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import fitted_of_each
 from scapo.registered.joint_proposals import JointProposal, PosedViews
-from scapo.registered.objects import OneObject, rows_of_draws
-from scapo.registered.pose_search import SearchResult
+from scapo.registered.objects import AGREEING, OneObject, rows_of_draws
+from scapo.registered.orientation import OrientationScorer
+from scapo.registered.pose_search import Hypotheses, SearchResult
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_states import Motion
 from scapo.registered.views import PartialViews
@@ -37,16 +38,21 @@ FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 40.
 """A view that a first template is fitted to; an object beside its pairs; the first template of
 several objects; bundle adjustment after a search; a dense template; axes that deviate."""
 VIEW = 0.072  # A view that is searched
+TAUGHT = 0.08  # A view of an object that tells how objects stand
 BELIEF = 20.0  # Seconds of steps for which usual times count, beside those that were measured
 RECORDS: tuple[type[Any], ...] = (
-    Candidate, Inliers, JointProposal, Motion, OneObject, PartialViews, Placement, PosedViews,
-    SearchResult,
+    Candidate, Hypotheses, Inliers, JointProposal, Motion, OneObject, PartialViews, Placement,
+    PosedViews, SearchResult,
 )  # fmt: skip
 """What steps return, beside templates."""
 
 
 def plan_of(
-    config: DiscoveryConfig, kinds: tuple[JointKind, ...], views: int, objects: int = 0
+    config: DiscoveryConfig,
+    kinds: tuple[JointKind, ...],
+    views: int,
+    objects: int = 0,
+    further: int = 0,
 ) -> dict[str, float]:
     """The steps of a discovery in order, and the seconds that each usually takes on one core.
 
@@ -55,6 +61,7 @@ def plan_of(
         kinds: Of the joints.
         views: All that are learned from.
         objects: Objects of each of which views are known.
+        further: Those beside them.
     """
     judged = VIEW * min(config.judged, views // JUDGES)
     half = VIEW * min(config.searched // 2, views) + FIT
@@ -73,6 +80,12 @@ def plan_of(
     plan["dense template"] = DENSE * config.dense_rounds
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION
+    if objects:
+        pairs = comb(config.further_views, 2) * PAIR * config.rotations / GRID
+        plan |= dict.fromkeys(numbered("further object", further), pairs)
+        shown = objects * config.object_views + further * config.further_views
+        plan["search of objects"] = VIEW * AGREEING * shown
+        plan["how objects stand"] = TAUGHT * AGREEING * shown
     plan["search of all views"] = VIEW * views
     return plan
 
@@ -125,7 +138,8 @@ class Course:
         self.generator, self.plan, self.journal = generator, plan, journal
         self.usual, self.spent = 0.0, 0.0  # Seconds of the steps that were taken
         makers: dict[str, Callable[..., Any]] = {kind.__name__: kind for kind in RECORDS}
-        self.makers = {**makers, ArticulatedTemplate.__name__: partial(_template, kinds)}
+        makers[ArticulatedTemplate.__name__] = partial(_template, kinds)
+        self.makers = {**makers, OrientationScorer.__name__: _scorer}
 
     def step(self, name: str, make: Callable[[], T]) -> T:
         """What the step makes, or made before it was interrupted; steps in between are over."""
@@ -148,5 +162,11 @@ class Course:
 
 def _template(kinds: tuple[JointKind, ...], **state: Tensor) -> ArticulatedTemplate:
     made = ArticulatedTemplate(kinds, len(state["points"]))
+    made.load_state_dict(state)
+    return made
+
+
+def _scorer(**state: Tensor) -> OrientationScorer:
+    made = OrientationScorer()
     made.load_state_dict(state)
     return made

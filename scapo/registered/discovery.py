@@ -31,7 +31,10 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.course import JUDGES, Course, numbered, plan_of
 from scapo.registered.initialisation import common_frame, fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
+from scapo.registered.object_frames import all_views, taught_by_objects
 from scapo.registered.objects import (
+    AGREEING,
+    ObjectViews,
     OneObject,
     draws_of,
     object_candidate,
@@ -39,10 +42,13 @@ from scapo.registered.objects import (
     owned_views,
     surest_first,
 )
+from scapo.registered.orientation import OrientationScorer
+from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import (
     Searched,
     SearchResult,
     find_inliers,
+    search_near,
     search_views,
     unexplained,
 )
@@ -52,6 +58,7 @@ from scapo.registered.views import PartialViews
 logger = logging.getLogger(__name__)
 
 STRIDE = 3  # Views by which the draws are apart
+NO_OBJECTS = ObjectViews()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,6 +67,8 @@ class Discovery:
 
     template: ArticulatedTemplate
     found: SearchResult
+    scorer: OrientationScorer | None = None
+    """What objects told of how they stand; None where none are known."""
 
 
 def discover(
@@ -67,7 +76,7 @@ def discover(
     kinds: tuple[JointKind, ...],
     config: DiscoveryConfig,
     generator: torch.Generator,
-    objects: Sequence[PartialViews] = (),
+    objects: ObjectViews = NO_OBJECTS,
     journal: Journal = Journal(),  # noqa: B008 - it has no state
 ) -> Discovery:
     """The articulated template of views of one category, and its placement in all of them.
@@ -80,15 +89,16 @@ def discover(
         objects: Views of one object each, where it is known which show the same.
         journal: Told of every step; keeps them.
     """
-    plan = plan_of(config, kinds, len(views.points), len(objects))
+    plan = plan_of(config, kinds, len(views.points), len(objects.known), len(objects.further))
     course = Course(kinds, generator, plan, journal)
     judges, others = held_out(views, config.judged)
     total = len(others.points)
+    known = list[OneObject]()
     half: Searched = take(others, evenly(total, config.searched // 2))
     searched: Searched = take(others, evenly(total, config.searched))
-    if objects:
+    if objects.known:
         config = replace(config, way_out=False)  # the objects' own motions tell the axes
-        known = _known_objects(objects, kinds, config, course)
+        known = _known_objects(objects.known, kinds, config, course)
         tried = _of_objects(known, kinds, config, course)
         half = owned_views(known[: len(known) // 2], config.searched // 2)
         searched = owned_views(known, config.searched)
@@ -107,8 +117,9 @@ def discover(
     if config.leans and "revolute" in kinds:
         deviating = partial(with_axis_deviation, best, judges, config, generator)
         best = course.step("deviating axes", deviating)
-    found = course.step("search of all views", partial(search_views, best, views, config))
-    return Discovery(template=best.template, found=found)
+    scorer = _how_objects_stand(best, known, objects.further, config, course) if known else None
+    found = course.step("search of all views", partial(search_views, best, views, scorer))
+    return Discovery(template=best.template, found=found, scorer=scorer)
 
 
 def held_out(views: PartialViews, count: int) -> tuple[PartialViews, PartialViews]:
@@ -168,6 +179,24 @@ def _of_objects(
         course.step(f"{name}, template", partial(object_candidate, draw, kinds, config, generator))
         for name, draw in zip(numbered("draw", len(draws)), draws, strict=True)
     ]
+
+
+def _how_objects_stand(
+    best: Candidate,
+    known: list[OneObject],
+    further: Sequence[PartialViews],
+    config: DiscoveryConfig,
+    course: Course,
+) -> OrientationScorer:
+    """What tells of any view how it stands, learned from objects against the final template."""
+    posed = [one.posed for one in known]
+    for name, views in zip(numbered("further object", len(further)), further, strict=True):
+        frame = partial(common_frame, views, config.rotations, AGREEING, OWN_HIDDEN_COST)
+        posed.append(course.step(name, frame))
+    owned, kinds = all_views(posed), best.template.kinds
+    hypotheses = course.step("search of objects", partial(search_near, best, owned.views))
+    taught = partial(taught_by_objects, known, kinds, owned, hypotheses, course.generator)
+    return course.step("how objects stand", taught)
 
 
 def _best(

@@ -51,7 +51,8 @@ from scapo.registered.network import (
     procrustes,
     vote_losses,
 )
-from scapo.registered.objects import grouped
+from scapo.registered.objects import ObjectViews, grouped
+from scapo.registered.orientation import OrientationScorer
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
     BRIEF,
@@ -123,6 +124,7 @@ class AbstractRegistered(AbstractMethod):
                 for parameter in layer.parameters():
                     nn.init.uniform_(parameter, -bound, bound, generator=generator)
         self.pseudo = PseudoLabels()
+        self.orientation = OrientationScorer()
         self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None
 
     def stages(self) -> tuple[Stage, ...]:
@@ -160,6 +162,7 @@ class AbstractRegistered(AbstractMethod):
         self.template.load_state_dict(made.template.state_dict())
         self._set_pseudo_labels(cloud[:, 0], views, made.found)
         self.pseudo.belonging = inlier
+        self._learn_orientation(views, made, seed)
         self.to(device)
 
     def _observed(
@@ -216,6 +219,15 @@ class AbstractRegistered(AbstractMethod):
         camera = (placement.rotation.mT @ away[..., None])[..., 0]
         self.pseudo.set(key, placement, camera, trust)
         self.pseudo.show(ShownPoints.of(views))
+
+    def _learn_orientation(self, views: PartialViews, made: Discovery, seed: Tensor) -> None:
+        """From objects, or else from the views that are placed most surely."""
+        scorer, sure = made.scorer, (self.pseudo.trust > 0).cpu()
+        if scorer is None:
+            generator = torch.Generator().manual_seed(int(seed))
+            rotation = made.found.placement.rotation[sure]
+            scorer = OrientationScorer().learn(take(views, sure), rotation, generator)
+        self.orientation.load_state_dict(scorer.state_dict())
 
     def strip(self) -> None:
         """Keep of the training clouds what `quick` and `refine` look at: those placed surely."""
@@ -408,6 +420,7 @@ class AbstractRegistered(AbstractMethod):
             rendered=ViewBank.rendered(light(self.template), modes, camera),
             placed=placed,
             states=states,
+            scorer=self.orientation,
         )
 
 
@@ -436,7 +449,8 @@ class TemplateRegistration(AbstractRegistered):
         """Of all steps of a discovery."""
         config = self.config.discovery
         objects = config.objects if self.supervision else 0
-        return sum(plan_of(config, self.template.kinds, clouds, objects).values())
+        further = config.further_objects if self.supervision else 0
+        return sum(plan_of(config, self.template.kinds, clouds, objects, further).values())
 
     def _found(
         self,
@@ -447,10 +461,15 @@ class TemplateRegistration(AbstractRegistered):
     ) -> Discovery:
         """By registration and bundle adjustment of the views."""
         kinds, config = self.template.kinds, self.config.discovery
-        groups = [] if labels.instance is None else grouped(labels.instance.cpu(), config)
-        objects = [self._of_one_size(observation.points[rows].cpu()) for rows in groups]
-        if labels.instance is not None and not objects:
-            logger.warning("too few clouds of any one object: which show the same is not used")
+        objects = ObjectViews()
+        if labels.instance is not None:
+            known, further = (
+                [self._of_one_size(observation.points[rows].cpu()) for rows in some]
+                for some in grouped(labels.instance.cpu(), config)
+            )
+            objects = ObjectViews(known=known, further=further)
+            if not known:
+                logger.warning("too few clouds of any one object: which show the same is not used")
         return discover(learned.views, kinds, config, generator, objects, self.journal)
 
     def _of_one_size(self, cloud: Float[Tensor, "B N 3"]) -> PartialViews:

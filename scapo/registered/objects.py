@@ -19,7 +19,6 @@ from itertools import permutations, product
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from scapo.categories import JointKind
@@ -29,6 +28,7 @@ from scapo.registered.bundle_adjustment import Candidate, Inliers, first_fit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import common_frame, first_template
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
+from scapo.registered.orientation import quarter_turns
 from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
@@ -50,6 +50,16 @@ WEIGHT_CAMERA, WEIGHT_SPREAD, WEIGHT_WAY, WEIGHT_AXIS = 1.3, 2.0, 1.0, 1.0
 SUPPORT = 3.0  # Of mean log support against the log of how far cameras are spread
 SURER = 30.0  # Power of a proposal's score against the best one's, by which its axis counts
 SWEEPS = 10  # Over all objects, in which each takes the frame that agrees best with the others
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObjectViews:
+    """Views of one object each."""
+
+    known: Sequence[PartialViews] = ()
+    """Of objects that a template may start from."""
+    further: Sequence[PartialViews] = ()
+    """Fewer, of others, which show how objects stand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,17 +187,24 @@ def object_candidate(
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 
-def grouped(instance: Int[Tensor, " N"], config: DiscoveryConfig) -> list[Int[Tensor, " K"]]:
-    """Which clouds are looked at of which objects, spread over all.
+def grouped(
+    instance: Int[Tensor, " N"], config: DiscoveryConfig
+) -> tuple[list[Int[Tensor, " _"]], list[Int[Tensor, " _"]]]:
+    """Which clouds are looked at of which objects, and of which further ones, spread over all.
 
     Objects of too few clouds (`LEAST_SHOWN`) are passed over, and all where few objects are left.
     """
     every = [(instance == number).nonzero()[:, 0] for number in instance.unique()]
     every = [rows for rows in every if len(rows) >= LEAST_SHOWN]
     if len(every) < LEAST_OBJECTS:
-        return []
+        return [], []
     some = evenly(len(every), config.objects).tolist()
-    return [every[k][evenly(len(every[k]), config.object_views)] for k in some]
+    others = [k for k in range(len(every)) if k not in some]
+    others = [others[k] for k in evenly(len(others), config.further_objects).tolist()]
+    return (
+        [every[k][evenly(len(every[k]), config.object_views)] for k in some],
+        [every[k][evenly(len(every[k]), config.further_views)] for k in others],
+    )
 
 
 def one_object(
@@ -272,11 +289,6 @@ def _signature(one: OneObject, reading: _Reading) -> Float[Tensor, " D"]:
             WEIGHT_AXIS * (sure[:, None, None] * axes[:, :, None] * axes[:, None]).flatten(),
         ]
     )
-
-
-def quarter_turns() -> list[Float[Tensor, "3 3"]]:
-    """The 24 rotations that take the axes of a frame to its axes."""
-    return list(torch.from_numpy(Rotation.create_group("O").as_matrix().round()).float())
 
 
 def _in_common(

@@ -20,6 +20,7 @@ from scapo.records import cat, take
 from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.joint_limits import JointLimits, limits_of, narrowest_limits
+from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pairwise import distinct, within
 from scapo.registered.pose_refinement import CHUNK, LIGHT, StepOptions, refine, search_states
 from scapo.registered.synchronisation import densest
@@ -95,6 +96,8 @@ class SearchSpace:
     """Of views that were placed; None where there are none."""
     states: Float[Tensor, "J S"]
     """Tried again before the last steps."""
+    scorer: OrientationScorer | None = None
+    """Of how objects stand."""
 
     def propose(self, views: PartialViews, count: int) -> Placement:
         """So many distinct placements of each view, those of a view in a row."""
@@ -109,10 +112,11 @@ class SearchSpace:
     def unlikeness(
         self, views: PartialViews, rotation: Float[Tensor, "B F 3 3"]
     ) -> Float[Tensor, "B F"]:
-        """What hypotheses are charged for looking like none that was placed."""
-        if self.placed is None:
-            return torch.zeros_like(rotation[..., 0, 0])
-        return self.placed.unlikeness(views, rotation)
+        """What hypotheses are charged for: looking like none that was placed, standing oddly."""
+        charge = torch.zeros_like(rotation[..., 0, 0])
+        if self.placed is not None:
+            charge = charge + self.placed.unlikeness(views, rotation)
+        return charge if self.scorer is None else charge + self.scorer.charge(views, rotation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,7 +225,7 @@ def find_inliers(
         anywhere: Whether cameras are sought anywhere.
     """
     views = searched.views if isinstance(searched, OwnedViews) else searched
-    hypotheses = search_near(candidate, views, config, anywhere)
+    hypotheses = search_near(candidate, views, anywhere=anywhere)
     found, limits = _within_limits(candidate, hypotheses, config)
     if isinstance(searched, OwnedViews):
         found, agrees = voted(hypotheses, limits, searched)
@@ -233,11 +237,13 @@ def find_inliers(
 
 
 def search_views(
-    candidate: Candidate, views: PartialViews, config: DiscoveryConfig
+    candidate: Candidate,
+    views: PartialViews,
+    scorer: OrientationScorer | None = None,
 ) -> SearchResult:
     """The best placement of every view with states that inliers have."""
     limits = limits_of(candidate.inliers.placement.state, candidate.template.kinds)
-    return search_near(candidate, views, config).best(limits.wider(CHARGED))
+    return search_near(candidate, views, scorer=scorer).best(limits.wider(CHARGED))
 
 
 def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConfig) -> float:
@@ -245,7 +251,7 @@ def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConf
 
     The range counts because a joint along a wrong axis explains almost as much with more of it.
     """
-    found, limits = _within_limits(candidate, search_near(candidate, views, config), config)
+    found, limits = _within_limits(candidate, search_near(candidate, views), config)
     return float(found.loss.mean()) + config.range_cost * limits.extent()
 
 
@@ -259,7 +265,11 @@ def _within_limits(
 
 
 def search_near(
-    candidate: Candidate, views: PartialViews, config: DiscoveryConfig, anywhere: bool = False
+    candidate: Candidate,
+    views: PartialViews,
+    *,
+    anywhere: bool = False,
+    scorer: OrientationScorer | None = None,
 ) -> Hypotheses:
     """Every view over rotations, states and shifts, cameras near those of inliers or anywhere."""
     template, inliers = candidate.template, candidate.inliers
@@ -273,6 +283,7 @@ def search_near(
         rendered=ViewBank.rendered(light(template), modes, cameras),
         placed=ViewBank.placed(template, shown, inliers.placement, inliers.cameras()),
         states=states,
+        scorer=scorer,
     )
     return search(template, views, space)
 

@@ -22,7 +22,9 @@ from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.course import Course, numbered, plan_of
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.method import TemplateRegistration
-from scapo.registered.pose_search import SearchResult
+from scapo.registered.objects import ObjectViews
+from scapo.registered.orientation import OrientationScorer
+from scapo.registered.pose_search import Hypotheses, SearchResult
 from scapo.registered.template import Placement
 from scapo.registered.views import PartialViews
 from scapo.training.journal import StoredJournal
@@ -80,6 +82,12 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return SearchResult(placement=truth, loss=torch.zeros(16), margin=torch.zeros(16))
 
     posed = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
+
+    def taught(*rest: Any) -> OrientationScorer:
+        made.append("taught")
+        torch.rand(1, generator=rest[-1])
+        return OrientationScorer()
+
     for name, step in {
         "common_frame": lambda *_: posed,
         "fitted_proposals": lambda *x: [candidate("first", x[-1]) for _ in range(3)],
@@ -90,6 +98,10 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         "with_axis_deviation": lambda one, *x: advancing(copied(one), *x),
         "advance": advancing,
         "search_views": searching,
+        "search_near": lambda *x, **y: Hypotheses(
+            placement=truth, loss=torch.zeros(16, 1), unlike=torch.zeros(16, 1)
+        ),
+        "taught_by_objects": taught,
     }.items():
         monkeypatch.setattr(discovery, name, step)
     return made
@@ -97,8 +109,9 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def discovered(journal: Journal, objects: int, config: DiscoveryConfig = FEW) -> torch.Tensor:
     views, _ = shown()
-    several = [views] * objects
+    several = ObjectViews(known=[views] * objects, further=[views] * (objects // 2))
     found = discovery.discover(views, KINDS, config, generator(3), several, journal)
+    assert (found.scorer is None) == (objects == 0)
     return found.template.pivot.detach()
 
 
@@ -109,7 +122,7 @@ def test_the_plan_names_the_steps_that_are_taken(
 ) -> None:
     journal, config = Told(), replace(FEW, mirror=mirror)
     discovered(journal, objects, config)
-    plan = plan_of(config, KINDS, 16, objects)
+    plan = plan_of(config, KINDS, 16, objects, objects // 2)
     assert [words for words, _, _ in journal.lines] == list(plan)
     seconds = list(plan.values())
     alone = ["judging first templates", "judging templates"] if objects else []
@@ -180,7 +193,7 @@ def test_an_interrupted_discovery_goes_on_bit_for_bit(
             return made
 
     caplog.set_level(logging.WARNING)
-    for _ in plan_of(FEW, KINDS, 16, objects):
+    for _ in plan_of(FEW, KINDS, 16, objects, objects // 2):
         with pytest.raises(InterruptedStepError):
             discovered(Cut(), objects)
     assert torch.equal(discovered(Cut(), objects), whole)

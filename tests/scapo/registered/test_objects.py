@@ -23,9 +23,9 @@ from scapo.registered.objects import (
     object_candidate,
     one_object,
     owned_views,
-    quarter_turns,
     surest_first,
 )
+from scapo.registered.orientation import quarter_turns
 from scapo.registered.pose_search import Hypotheses, voted
 from scapo.registered.template import Placement
 from scapo.registered.view_states import Motion
@@ -55,13 +55,6 @@ def known(turn: torch.Tensor, seed: int, scores: tuple[float, float, float]) -> 
     )
 
 
-def test_quarter_turns_are_the_rotations_of_a_cube() -> None:
-    turns = torch.stack(quarter_turns())
-    assert torch.equal(turns @ turns.mT, torch.eye(3).expand(24, 3, 3))
-    assert torch.equal(torch.det(turns), torch.ones(24))
-    assert len({tuple(turn.flatten().tolist()) for turn in turns}) == 24
-
-
 def test_objects_whose_frames_are_turned_come_to_one_frame() -> None:
     turns = quarter_turns()
     picked = [turns[k] for k in (0, 5, 11, 16, 23)]
@@ -83,12 +76,18 @@ def test_groups_hold_clouds_of_one_object_and_pass_over_those_with_few() -> None
     order = torch.randperm(54, generator=generator(0))
     instance = torch.tensor([3] * 20 + [5] * 4 + [8] * 9 + [1] * 12 + [9] * 9)[order]
     config = DiscoveryConfig(objects=10, object_views=10)
-    groups = grouped(instance, config)
+    groups, further = grouped(instance, config)
     assert [instance[rows].unique().tolist() for rows in groups] == [[1], [3], [8], [9]]
     assert [len(rows) for rows in groups] == [10, 10, 9, 9]
-    assert len(grouped(instance, DiscoveryConfig(objects=2))) == 2
-    assert grouped(instance[instance != 9], config) == []  # three objects tell no category
-    assert grouped(torch.arange(40), config) == []
+    assert further == []
+    few = DiscoveryConfig(objects=2, further_objects=9, further_views=5)
+    groups, further = grouped(instance, few)
+    assert [instance[rows].unique().tolist() for rows in groups] == [[1], [9]]
+    assert [instance[rows].unique().tolist() for rows in further] == [[3], [8]]
+    assert [len(rows) for rows in further] == [5, 5]
+    assert len(grouped(instance, replace(few, further_objects=1))[1]) == 1
+    assert grouped(instance[instance != 9], config) == ([], [])  # three objects tell no category
+    assert grouped(torch.arange(40), config) == ([], [])
 
 
 @pytest.mark.parametrize("each", [5, 8])
@@ -98,7 +97,7 @@ def test_clouds_are_grouped_where_each_object_shows_enough(
     told: list[int] = []
 
     def discovering(*args: Any) -> NoReturn:
-        told.extend(len(views.points) for views in args[4])
+        told.extend(len(views.points) for views in args[4].known)
         raise InterruptedError
 
     monkeypatch.setattr(method, "discover", discovering)

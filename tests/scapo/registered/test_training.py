@@ -82,7 +82,7 @@ def test_the_same_views_give_the_same_template_interrupted_or_not(
         raise InterruptedRunError
 
     def found(journal: Journal) -> Discovery:
-        return discover(views, ("revolute",), few, generator(3), (), journal)
+        return discover(views, ("revolute",), few, generator(3), journal=journal)
 
     def stored() -> StoredJournal:
         return StoredJournal(tmp_path, {}, "votes", lambda *_: None)
