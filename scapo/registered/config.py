@@ -111,8 +111,8 @@ class SearchConfig:
     grid_hypotheses: int = 32
     """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
     and were placed in training, half as of images of the template; 0: the network's four."""
-    quick_hypotheses: int = 12
-    """Placements of each cloud that `quick` begins with."""
+    quick_hypotheses: int = 6
+    """Placements of each cloud that `quick` begins with, of 32 those that stand as objects do."""
     strays: Literal["out", "kept"] = "out"
     """Whether outliers, points that do not belong to the object, are left out."""
     settle: bool = True

@@ -10,11 +10,13 @@ its placements in the most confident ones. Outliers of the clouds are left out (
 label is used anywhere: templates, hypotheses and confidence come from the loss of the views alone.
 Camera positions of the training clouds are known (their frame's origin).
 
-`fast` is the network alone, which sees the points only. `quick` and `refine` fit the template to
-the cloud from hypotheses that two banks of images propose (`view_bank`): `quick` a few in a few
-steps, `refine` more of them to the end. For that they ask where the camera was: at the origin of
-the cloud's frame or at `Observation.sensor`, or (`camera="estimated"`) where the network believes
-it.
+Two banks of images propose how the template may stand in a cloud (`view_bank`), and a scorer that
+learned what standing objects look like sorts the proposals (`orientation`). `fast` asks the network
+in the likeliest frame. `quick` and `refine` fit the template to the cloud: `quick` from a few
+proposals in a few steps, `refine` from more of them to the end. All ask where the camera was: at
+the origin of the cloud's frame or at `Observation.sensor`. Where that is not known
+(`camera="estimated"`) the network is asked in four frames that the points alone tell, and where
+it believes the camera is there `quick` and `refine` take it to be.
 """
 
 from __future__ import annotations
@@ -31,7 +33,6 @@ from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
-from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.pictures import PictureData
 from scapo.records import take
@@ -43,12 +44,14 @@ from scapo.registered.discovery import Discovery, discover
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.network import (
+    FRAMES,
     PointVotes,
     Target,
     Votes,
     own_frame,
     principal_frames,
     procrustes,
+    random_frames,
     vote_losses,
 )
 from scapo.registered.objects import ObjectViews, grouped
@@ -82,11 +85,8 @@ logger = logging.getLogger(__name__)
 LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
 SAMPLED = 2  # Times `points` that are drawn from a cloud, of which the farthest are learned from
 NOISE = 0.003  # Normalised length: standard deviation of the points' noise while the network learns
-TURN = 0.15
-"""Rad: standard deviation of the turn away from a principal frame while the network learns."""
 LAST_RATE = 0.01  # Share of the learning rate at the end
 ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
-FRAMES = 4  # Hypotheses of the network for each cloud, one in each of its principal frames
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -241,7 +241,7 @@ class AbstractRegistered(AbstractMethod):
         device = points.device
         index = torch.randperm(points.shape[1], generator=step.generator, device=device)
         points = self._thinned(points[:, index[: SAMPLED * self.config.points]])
-        frame = self._random_frames(points, step.generator)
+        frame = random_frames(points, self.pseudo.rotation[row].mT, step.generator)
         noise = torch.randn(points.shape, generator=step.generator, device=device) * NOISE
         votes = self.network((points + noise) @ frame.mT)
         return vote_losses(votes, self._target(points, row))
@@ -263,16 +263,6 @@ class AbstractRegistered(AbstractMethod):
         count = min(self.config.points, points.shape[1])
         return gather(points, farthest_points(points, count))
 
-    def _random_frames(
-        self, points: Float[Tensor, "B K 3"], generator: torch.Generator
-    ) -> Float[Tensor, "B 3 3"]:
-        """One of each cloud's principal frames, turned a little."""
-        frames = principal_frames(points)
-        device, count = points.device, len(points)
-        pick = torch.randint(FRAMES, (count,), generator=generator, device=device)
-        turn = TURN * torch.randn(count, 3, generator=generator, device=device)
-        return rotvec_to_rotmat(turn) @ frames[torch.arange(count, device=device), pick]
-
     @torch.no_grad()
     def _target(self, points: Float[Tensor, "B K 3"], row: Int[Tensor, " B"]) -> Target:
         placement = take(self.pseudo.placement(), row)
@@ -292,9 +282,15 @@ class AbstractRegistered(AbstractMethod):
         self, points: Float[Tensor, "B K 3"]
     ) -> tuple[Placement, tuple[Votes, Float[Tensor, "B 4"]]]:
         """Placements from the four frames of each cloud, in a row, with the votes behind them."""
-        count = len(points)
         frames = principal_frames(points).flatten(0, 1)
-        turned = points.repeat_interleave(FRAMES, 0) @ frames.mT
+        placement, votes, sure = self._votes(points.repeat_interleave(FRAMES, 0), frames)
+        return placement, (votes, sure.view(len(points), FRAMES))
+
+    def _votes(
+        self, points: Float[Tensor, "B K 3"], frames: Float[Tensor, "B 3 3"]
+    ) -> tuple[Placement, Votes, Float[Tensor, " B"]]:
+        """What the network says of each cloud in a frame, and how sure it is."""
+        turned = points @ frames.mT
         votes = self.network(turned)
         weight = votes.sureness.sigmoid().square()
         rotation, translation = procrustes(turned, votes.points, weight)
@@ -306,7 +302,7 @@ class AbstractRegistered(AbstractMethod):
             shift=votes.shift,
             deviation=torch.zeros_like(votes.shift),
         )
-        return placement, (votes, weight.mean(1).view(count, FRAMES))
+        return placement, votes, weight.mean(1)
 
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
         """The template over its states, and where the network places it."""
@@ -324,18 +320,23 @@ class AbstractRegistered(AbstractMethod):
         cloud = observation.points.to(self.template.points)
         clean, similarity = normalise(replaced(cloud, self._inlier_mask(cloud)))
         points = similarity.forward(cloud)
-        if mode == "fast":
-            kept = self._thinned(clean)
+        index = farthest_points(clean, min(self.config.points, clean.shape[1]))
+        kept = gather(clean, index)
+        standing = self.config.camera == "known" and bool(self.orientation.learned)
+        if mode == "fast" and not standing:
             chosen, votes, confidence = self._surest(kept)
             weight = gather(votes.part.softmax(-1), nearest(points, kept))
             return self._answer(chosen, weight, similarity, confidence)
-        index = farthest_points(clean, min(self.config.points, clean.shape[1]))
-        kept = gather(clean, index)
         camera, frame = self._camera(observation, similarity, kept), own_frame(kept)
         turned = (frame @ camera[..., None])[..., 0]
         views = observe(clean @ frame.mT, turned, index=index)
-        chosen, confidence = self._searched(views, mode)
-        weight = nearest_weights(self.template, points @ frame.mT, chosen, turned)
+        if mode == "fast":
+            frames = self._space().propose(views, 1).rotation.mT
+            chosen, votes, confidence = self._votes(views.points, frames)
+            weight = gather(votes.part.softmax(-1), nearest(points @ frame.mT, views.points))
+        else:
+            chosen, confidence = self._searched(views, mode)
+            weight = nearest_weights(self.template, points @ frame.mT, chosen, turned)
         chosen = turn_placement(chosen, frame.mT)
         return self._answer(chosen, weight, similarity, confidence)
 

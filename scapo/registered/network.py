@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""A small network in which points vote for the pose, exactly equivariant by principal frames.
+"""A small network in which points vote for the pose, in frames that turn with the cloud.
 
-A cloud is expressed in the four proper frames of its principal axes: the set of four does not
-change when the cloud is turned or moved. In each frame a plain point network says where every
-point lies on the placed template (template axes, this cloud's size and state), how sure it is,
-and which part it belongs to; a weighted Procrustes step turns the votes into a pose. The frame
-whose points are surest wins. Learned towards the placements that search and
-bundle adjustment found.
+A plain point network is given a cloud in some frame and says where every point lies on the placed
+template (template axes, this cloud's size and state), how sure it is, and which part it belongs to;
+a weighted Procrustes step turns the votes into a pose. The frame is one in which the object may
+stand (`orientation`), or one of the four proper frames of the cloud's principal axes, a set that
+does not change when the cloud is turned or moved; of those the one whose points are surest wins.
+Learned towards the placements that search and bundle adjustment found.
 """
 
 from __future__ import annotations
@@ -21,9 +21,14 @@ from torch import Tensor, nn
 
 from scapo.geometry.points import MEAN_RADIUS, gather, k_nearest
 from scapo.geometry.rigid import project_rotation
+from scapo.geometry.rotations import rotvec_to_rotmat
 
 SIGNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 """Flips of the principal axes that keep the frame right-handed."""
+FRAMES = len(SIGNS)  # Principal frames of a cloud
+STANDING, ASKEW, TURN = 0.5, 0.25, 0.15
+"""Share of the clouds that are learned as they stand, as `fast` asks, and the standard deviations
+of the turns away from that frame and from a principal one, rad."""
 CAMERA_UNIT = 4.0  # Camera positions are learned in this many normalised units
 WIDTH, NEIGHBOURS = 48, 12
 """Channels of the narrowest layer, and nearest points that the first one sees."""
@@ -128,6 +133,28 @@ def principal_frames(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 4 3 3"]
     frame = frame * torch.linalg.det(frame).sign()[:, None, None]
     signs = torch.tensor(SIGNS).to(points)
     return signs[:, :, None] * frame[:, None]
+
+
+def random_frames(
+    points: Float[Tensor, "B K 3"],
+    standing: Float[Tensor, "B 3 3"],
+    generator: torch.Generator,
+) -> Float[Tensor, "B 3 3"]:
+    """A frame of each cloud to learn in: one of its principal ones or that in which it stands.
+
+    Args:
+        points: Of each cloud.
+        standing: template_R_cloud.
+        generator: On the device of the points.
+    """
+    device, count = points.device, len(points)
+    pick = torch.randint(FRAMES, (count,), generator=generator, device=device)
+    frames = principal_frames(points)[torch.arange(count, device=device), pick]
+    draw = torch.rand(count, generator=generator, device=device)
+    turn = torch.randn(count, 3, generator=generator, device=device)
+    stands = (draw < STANDING)[:, None]
+    frames = torch.where(stands[..., None], standing, frames)
+    return rotvec_to_rotmat(torch.where(stands, ASKEW, TURN) * turn) @ frames
 
 
 def own_frame(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 3 3"]:

@@ -75,6 +75,7 @@ BRIEF = Effort(
     long=StepOptions(steps=4, points=96, template_points=96),
     last=StepOptions(steps=2, points=192),
 )
+PROPOSED = 32  # Placements that banks propose where fewer are asked for of those that stand right
 STATES = (150.0, 250.0)  # Sharpness of the losses by which the winner's states are tried
 STATE_GRID, STATE_EVERY = 13, 2
 """States that are tried then, and one in so many points that they are tried with."""
@@ -99,8 +100,22 @@ class SearchSpace:
     scorer: OrientationScorer | None = None
     """Of how objects stand."""
 
+    @torch.no_grad()
     def propose(self, views: PartialViews, count: int) -> Placement:
-        """So many distinct placements of each view, those of a view in a row."""
+        """So many distinct placements of each view, those of a view in a row.
+
+        Of more that the banks propose, where it is known how objects stand.
+        """
+        if self.scorer is None or not bool(self.scorer.learned) or count >= PROPOSED:
+            return self._looking_alike(views, count)
+        found = self._looking_alike(views, PROPOSED)
+        turns = found.rotation.unflatten(0, (len(views.points), PROPOSED))
+        best = self.scorer(views, turns).topk(count, 1).indices
+        first = PROPOSED * torch.arange(len(best), device=best.device)
+        return take(found, (best + first[:, None]).flatten())
+
+    def _looking_alike(self, views: PartialViews, count: int) -> Placement:
+        """Half of them by either bank."""
         if self.placed is None:
             return self.rendered.propose(views, count)
         sizes = (count - count // 2, count // 2)

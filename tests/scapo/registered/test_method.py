@@ -107,6 +107,29 @@ def test_quick_and_refine_find_the_poses_whatever_the_network_says():
     assert len(observation.points) == 12
 
 
+def test_where_it_is_known_how_objects_stand_the_network_is_asked_there():
+    """It was taught these clouds; a scorer that knows them too leads it to their frames."""
+    method, observation = trained(150)
+    views, truth = sighted(12, seed=60)
+    apart = []
+    for taught in (False, True):
+        if taught:
+            method.orientation.learn(views, truth.rotation, generator(3), epochs=40)
+        found = method.predict(observation).camera_T_part
+        assert found is not None
+        apart.append(rotation_angle(found[:, 0, :3, :3], truth.rotation).rad2deg().median())
+    assert apart[1] < 15
+    assert apart[1] < apart[0]
+    hidden = TemplateRegistration(
+        replace(method.config, camera="estimated"), method.category, generator(0)
+    )
+    hidden.load_state_dict(method.state_dict())
+    unasked = hidden.eval().predict(observation).camera_T_part
+    assert unasked is not None  # in the principal frames, as nobody knows the camera
+    off = rotation_angle(unasked[:, 0, :3, :3], truth.rotation).rad2deg().median()
+    assert off == pytest.approx(float(apart[0]), abs=1e-2)
+
+
 def test_what_is_drawn_once_follows_the_template():
     method, observation = trained(0)
     before = method.predict(observation, "quick").canonical_points

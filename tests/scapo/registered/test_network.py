@@ -6,8 +6,16 @@ from __future__ import annotations
 import torch
 from torch.testing import assert_close
 
-from scapo.geometry.rigid import random_rotations
-from scapo.registered.network import PointVotes, Target, principal_frames, procrustes, vote_losses
+from scapo.geometry.rigid import random_rotations, rotation_angle
+from scapo.registered.network import (
+    ASKEW,
+    PointVotes,
+    Target,
+    principal_frames,
+    procrustes,
+    random_frames,
+    vote_losses,
+)
 from tests.helpers.strategies import generator, is_rotation
 
 
@@ -27,6 +35,20 @@ def test_the_four_frames_turn_with_the_cloud():
     again = turned @ (points @ turn.T)[:, None].mT
     gap = (seen[:, :, None] - again[:, None]).abs().amax((-1, -2)).amin(-1)
     assert gap.max() < 1e-3
+
+
+def test_clouds_are_learned_as_they_stand_or_in_a_principal_frame():
+    points = clouds(1).expand(400, 64, 3)
+    standing = random_rotations(400, generator(4))
+    frames = random_frames(points, standing, generator(5))
+    assert bool(is_rotation(frames).all())
+    near = principal_frames(points)
+    off = rotation_angle(frames, standing)
+    beside = rotation_angle(frames[:, None].expand_as(near), near).amin(1)
+    stands = off < 4 * ASKEW
+    assert 0.4 < float(stands.float().mean()) < 0.65
+    assert bool((stands | (beside < 1.0)).all())
+    assert 0.25 < float(off[stands].median()) < 0.6  # of three angles, each 0.25 about
 
 
 def test_procrustes_ignores_points_without_weight():
