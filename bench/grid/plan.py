@@ -245,11 +245,8 @@ class _Maker:
             predicted = self._predict(split, mode, part, name)
             yield predicted, clouds
             looked = LOOKED_AT if seed == 1 and split.endswith("/test") else SCORED
-            # training clouds are beside this part's splits, not beside real ones, where answers are
-            # taken in the frame that was fitted after training
-            own = "" if split.startswith("real/") else frames
             for kind in looked:
-                yield self._about(kind, predicted, split, own), clouds
+                yield self._about(kind, predicted, split, frames), clouds
 
     def _about(self, kind: Kind, predicted: Step, split: str, frames: str) -> Step:
         """A step that reads predictions: their scores, why they are so, what they look like."""
