@@ -246,8 +246,10 @@ def find_training(folder: Path, trained: Header, scored: Split) -> Split:
         found = None
     if found is not None and found.manifest.digest == trained.data_digest:
         return found
-    parts = scored.folder.resolve().parent.parent.parent
-    for path in sorted(parts.glob(f"*/{trained.category}/{trained.split}/manifest.json")):
+    beside = dict.fromkeys(path.parents[2] for path in (scored.folder.absolute(),
+                                                        scored.folder.resolve()))  # fmt: skip
+    name = f"*/{trained.category}/{trained.split}/manifest.json"
+    for path in (path for parts in beside for path in sorted(parts.glob(name))):
         other = _readable(path.parent)
         if other is not None and other.manifest.digest == trained.data_digest:
             other.verify()

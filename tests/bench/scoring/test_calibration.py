@@ -115,6 +115,11 @@ def test_real_objects_are_calibrated_on_the_training_split_of_another_part(tmp_p
     assert report["calibration"]["data"] == train.manifest.digest
     assert report["summary"]["part_rotation_deg"]["mean"] == pytest.approx(0, abs=1e-3)
     assert evaluate(dataclasses.replace(request, data=tmp_path))["summary"] == report["summary"]
+    (tmp_path / "real").rename(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere" / "deeper").mkdir()
+    (tmp_path / "elsewhere" / "laptop").rename(tmp_path / "elsewhere" / "deeper" / "laptop")
+    (tmp_path / "real").symlink_to(tmp_path / "elsewhere" / "deeper")  # beside the link, not it
+    assert evaluate(request)["summary"] == report["summary"]
     train.folder.rename(tmp_path / "gone")
     with pytest.raises(StoreError, match="train"):
         evaluate(request)
