@@ -176,6 +176,7 @@ def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -
         return [type("Reading", (), {"turn": turns[k].mT})() for k in range(len(some))]
 
     monkeypatch.setattr(object_frames, "agreeing", readings)
+    monkeypatch.setattr(object_frames, "TAUGHT", (0.4, 0.6, 0.9))  # two rounds of five
     owned = all_views([one.posed for one in posed])
     scorer = taught_by_objects(posed[:12], ("revolute",), owned, hypotheses, generator(8))
     others, truth = standing(60, 9)
