@@ -29,7 +29,7 @@ with quit_at_interrupt("demo"):  # these take a second
     from bench.figures.pictures import predictions_picture, training_curve
     from bench.grid.command import Program, StepError, run_command
     from scapo import store
-    from scapo.predictor import find, released
+    from scapo.released import find, released
 
 RELEASED = "released"
 CURVED = ("scapo", "registered")

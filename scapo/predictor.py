@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import get_args
 
@@ -12,20 +11,12 @@ import torch
 from torch import Tensor
 
 from scapo.alignment import Alignment, unit_length
-from scapo.categories import CATEGORIES
 from scapo.method import AbstractMethod, Mode
 from scapo.records import map_tensors
 from scapo.registry import load_method
+from scapo.released import find
 from scapo.store.checkpoint import check_header
-from scapo.store.schema import StoreError
-from scapo.text import did_you_mean
 from scapo.types import Observation, Prediction
-
-RELEASED = "weights"
-"""Folder in the package with the released checkpoints: CATEGORY.safetensors of the method that
-answers by default, CATEGORY-METHOD.safetensors of others."""
-CHECKOUT = Path("results", "checkpoints")
-"""The same folder in a checkout, from which the package's is made."""
 
 
 class Predictor:
@@ -148,35 +139,3 @@ def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
     path = find(path_or_category)
     method, header = load_method(path)
     return Predictor(method, device, check_header(header, str(path)).alignment)
-
-
-def find(path_or_category: str | Path) -> Path:
-    """The checkpoint's path.
-
-    Raises:
-        StoreError: Nothing of that name.
-    """
-    path = Path(path_or_category)
-    if path.exists():
-        return path
-    weights = {name.replace("-", "/", 1): file for name, file in _weights().items()}
-    if str(path_or_category) in weights:
-        return weights[str(path_or_category)]
-    known = ", ".join(weights) or "none yet"
-    raise StoreError(
-        f"{path_or_category}: expected a run folder, a checkpoint or a category with released "
-        f"weights ({known}), found none{did_you_mean(str(path_or_category), weights)}"
-    )
-
-
-def released() -> dict[str, Path]:
-    """Checkpoints that come with the package, by category: each of its default method."""
-    return {name: path for name, path in _weights().items() if name in CATEGORIES}
-
-
-def _weights() -> dict[str, Path]:
-    """Every checkpoint that comes with the package or the checkout, by the name of its file."""
-    package = Path(str(files("scapo")))
-    folders = (package / RELEASED, package.parent / CHECKOUT)
-    found = [path for folder in folders for path in sorted(folder.glob("*.safetensors"))]
-    return {path.stem: path for path in found if path.stem.partition("-")[0] in CATEGORIES}

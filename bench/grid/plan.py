@@ -20,6 +20,7 @@ import tyro
 from bench.grid.presets import PRESETS, REAL, Entry, Preset, PresetName, flags_of, training_seconds
 from bench.methods import METHODS
 from bench.requests import Mode
+from scapo.released import weights
 from scapo.store import StoreError, canonical_json, sha256_bytes, sha256_file, write_bytes
 from scapo.store.json_records import read_json
 from scapo.store.manifest import read_manifest
@@ -43,7 +44,7 @@ Kind = Literal["train", "predict", "evaluate", "explain", "pictures"]
 
 SCORED: tuple[Kind, ...] = ("evaluate",)
 LOOKED_AT: tuple[Kind, ...] = ("evaluate", "explain", "pictures")
-"""What is made of predictions, of those on `test` by the first seed more."""
+"""What is made of predictions, of those on `test` by the first seed in its last mode more."""
 SUFFIX = ".safetensors"
 
 
@@ -62,11 +63,13 @@ class Step:
     """Steps before it in the chain."""
     reads: tuple[str, ...] = ()
     """Splits, PART/CATEGORY/SPLIT."""
+    model: str = ""
+    """SHA-256 of the released model that it asks; "" where it asks one of this run."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chain:
-    """One training, and what is made of it."""
+    """One training or released model, and what is made of it."""
 
     part: str
     category: str
@@ -173,7 +176,8 @@ class _Maker:
                 for entry in self.preset.entries:
                     if part in entry.parts and seed in entry.seeds:
                         for category in categories:
-                            yield self.chain(entry, part, category, seed)
+                            if not entry.models or released_model(entry, part, category):
+                                yield self.chain(entry, part, category, seed)
 
     def chain(self, entry: Entry, part: str, category: str, seed: int) -> Chain:
         """Training, then for each mode the frames and every split that is scored."""
@@ -201,6 +205,9 @@ class _Maker:
 
     def trainings(self, entry: Entry, place: str, seed: int) -> Iterator[tuple[Step, float | None]]:
         """The training, after the one that it starts from, with their estimates."""
+        if entry.models:
+            self.configs[entry.label] = {"method": entry.method, "models": list(entry.models)}
+            return
         step, cost = self.training(entry, place, seed)
         config = self.made[entry.label]
         if entry.start is not None:
@@ -236,15 +243,19 @@ class _Maker:
         """Predictions and scores of one mode, with the number of clouds of each step."""
         (part, category), frames = place.split("/"), ""
         name = name_of(entry, category, seed)
-        if "pose" not in METHODS[entry.method].supervision:
+        model = released_model(entry, part, category)
+        if "pose" not in METHODS[entry.method].supervision and model is None:
             frames = f"predict-{mode}-train"
             limit = self.preset.calibration
             yield self._predict(f"{place}/train", mode, part, name, limit), limit
         for split in scored:
             clouds = self.count(split)
             predicted = self._predict(split, mode, part, name)
+            if model is not None:
+                predicted = of_model(predicted, *model)
             yield predicted, clouds
-            looked = LOOKED_AT if seed == 1 and split.endswith("/test") else SCORED
+            best = seed == 1 and mode == entry.modes[-1]
+            looked = LOOKED_AT if best and split.endswith("/test") else SCORED
             for kind in looked:
                 yield self._about(kind, predicted, split, frames), clouds
 
@@ -309,6 +320,19 @@ def of_start(step: Step) -> Step:
     return replace(
         step, name=f"{step.name}-start", needs=tuple(f"{one}-start" for one in step.needs)
     )
+
+
+def released_model(entry: Entry, part: str, category: str) -> tuple[str, Path] | None:
+    """Name and file of the released model that stands for an entry's training, if there is one."""
+    known = weights()
+    names = [name.format(part=part, category=category) for name in entry.models]
+    return next(((name, known[name]) for name in names if name in known), None)
+
+
+def of_model(step: Step, name: str, path: Path) -> Step:
+    """A prediction of a run, asked of a released model instead."""
+    verb, _, *others = step.command
+    return replace(step, command=(verb, name, *others), needs=(), model=sha256_file(path))
 
 
 def own_preset(method: str, name: PresetName, own: str = "") -> tuple[str | None, Any]:
@@ -383,7 +407,7 @@ def freeze(path: Path, plan: Plan, *, anew: bool = False) -> bool:
     differs = [name for name in FROZEN if there[name] != now[name]]
     before = cast("dict[str, str | None]", there["data"])
     differs += [split for split, digest in plan.data.items()
-                if before.get(split) not in (None, digest)]  # fmt: skip
+                if digest is not None and before.get(split) not in (None, digest)]  # fmt: skip
     if differs:
         raise StoreError(
             f"{path}: expected the plan that would be followed today (commit {plan.commit}), found "

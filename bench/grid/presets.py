@@ -41,6 +41,8 @@ class Entry:
     """Of the method; by default the one that goes with the grid's."""
     start: Entry | None = None
     """A training that comes first, is scored as well, and whose run `--start` names."""
+    models: tuple[str, ...] = ()
+    """In place of a training: names of a released model, the first that is there."""
     flags: tuple[str, ...] = ()
     """Of `train`."""
     seeds: tuple[int, ...] = (1,)
@@ -119,6 +121,9 @@ REGISTERED = Entry(
 OBJECTS = replace(REGISTERED, name="registered-objects", seeds=(1,),
                   flags=("--supervision", "instance"))  # fmt: skip
 """Told which training clouds show the same object; trained and scored in the chain of `WARM`."""
+RELEASED = replace(REGISTERED, name="released", seeds=(1,), training=0,
+                   models=("{category}/{part}", "{category}"))  # fmt: skip
+"""What users get: the models that come with the package, in the frame that they answer in."""
 BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("refine",),
               training=300, seconds={"refine": 0.35})  # fmt: skip
 """What its search can do at best, with a template of true placements."""
@@ -126,7 +131,7 @@ WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=OBJECTS,
              flags=OBJECTS.flags, parts=("clean", "sensor"), training=1200,
              seconds={"fast": 0.01})  # fmt: skip
 """The paper's networks, begun at what template registration says: SCAPO, warm start."""
-GRID = (*NETWORKS, *LABELLED, REGISTERED, WARM, BOUND, *ABLATIONS)
+GRID = (*NETWORKS, *LABELLED, RELEASED, REGISTERED, WARM, BOUND, *ABLATIONS)
 
 PRESETS: Mapping[PresetName, Preset] = {
     "smoke": Preset(

@@ -34,7 +34,8 @@ from bench.runs.train import pick_device
 from bench.scoring.frame import LEAST_SAMPLES
 from bench.twin.record import Twin
 from scapo.method import evenly
-from scapo.predictor import Predictor, find
+from scapo.predictor import Predictor
+from scapo.released import find
 from scapo.store import Split, StoreError, open_split
 from scapo.store.files import require_suffix
 

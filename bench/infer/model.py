@@ -10,7 +10,8 @@ from bench.infer.calibration import Calibration, calibration_file, read_calibrat
 from bench.methods import load
 from bench.requests import Mode
 from scapo.categories import Category
-from scapo.predictor import Predictor, find, released
+from scapo.predictor import Predictor
+from scapo.released import find, released
 from scapo.store.checkpoint import WEIGHTS, check_header
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError

@@ -20,8 +20,8 @@ from bench.runs.train import pick_device
 from bench.scoring.scores import to_arrays
 from scapo.alignment import Alignment, ObjectFrame, unit_length
 from scapo.method import AbstractMethod, OracleMethod, evenly
-from scapo.predictor import find as find_checkpoint
 from scapo.records import map_tensors
+from scapo.released import find as find_checkpoint
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import check_header, require_fields
 from scapo.store.definitions import foreign

@@ -14,10 +14,11 @@ from torch.testing import assert_close
 from scapo.alignment import unit_length
 from scapo.categories import CATEGORIES
 from scapo.paper.method import Scapo
-from scapo.predictor import Predictor, load, released
+from scapo.predictor import Predictor, load
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
 from scapo.registry import LIBRARY
+from scapo.released import released
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, with_alignment, write_checkpoint
 from scapo.store.schema import StoreError
 from scapo.types import Observation, Prediction
@@ -134,7 +135,7 @@ def test_who_asks_for_no_mode_gets_the_usual_one(monkeypatch, name: str, usual: 
 
 
 def test_a_misspelt_category_is_told_the_one_that_looks_like_it(monkeypatch) -> None:
-    monkeypatch.setattr("scapo.predictor._weights", lambda: {"oven": Path(), "laptop": Path()})
+    monkeypatch.setattr("scapo.released.weights", lambda: {"oven": Path(), "laptop": Path()})
     with pytest.raises(StoreError, match=r"\(oven, laptop\), found none; did you mean 'oven'\?$"):
         load("oevn")
 

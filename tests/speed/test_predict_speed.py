@@ -16,7 +16,7 @@ from torch import Tensor
 
 import scapo
 from scapo.method import Mode
-from scapo.predictor import released
+from scapo.released import released
 from sim_assets import generate_samples
 
 ROUNDS: dict[Mode, int] = {"fast": 20, "quick": 10, "refine": 5}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -75,13 +76,36 @@ def test_every_output_is_made_once_and_every_need_is_met_before(cpu: Plan):
             before.add(step.name)
 
 
-def test_only_methods_without_poses_are_calibrated(cpu: Plan):
+def test_only_trainings_without_poses_are_calibrated(cpu: Plan):
     for chain in cpu.chains:
         scored = next(step for step in chain.steps if step.kind == "evaluate")
-        method = cpu.configs[chain.label]["method"]
-        assert ("--calibration" in scored.command) == ("pose" not in METHODS[method].supervision), (
-            chain.name
-        )
+        method, trained = cpu.configs[chain.label]["method"], chain.steps[0].kind == "train"
+        without = trained and "pose" not in METHODS[method].supervision
+        assert ("--calibration" in scored.command) == without, chain.name
+
+
+def test_a_released_model_is_asked_by_its_name(tmp_path: Path, monkeypatch):
+    models = {name: tmp_path / name.replace("/", "-") for name in ("oven", "laptop/sensor")}
+    for name, path in models.items():
+        path.write_text(name)
+    monkeypatch.setattr("bench.grid.plan.weights", lambda: models)
+    first = [c for c in make_plan("cpu", tmp_path).chains if c.label == "released"]
+    assert [c.name for c in first] == [
+        "clean/oven/released/seed1", "sensor/laptop/released/seed1"
+    ]  # fmt: skip
+    for chain, name in zip(first, ("oven", "laptop/sensor"), strict=True):
+        asked = [step for step in chain.steps if step.kind == "predict"]
+        assert {step.name for step in asked} == {
+            f"predict-{mode}-{split}" for mode in ("fast", "quick", "refine")
+            for split in ("test", "test-ood")
+        }  # fmt: skip
+        assert all(step.command[1] == name and not step.needs for step in asked)
+        drawn = next(step for step in chain.steps if step.kind == "pictures")
+        assert drawn.command[1] == name
+    models["oven"].write_text("another")
+    again = [c for c in make_plan("cpu", tmp_path).chains if c.label == "released"]
+    assert again[0] != first[0]  # another model is another plan
+    assert again[1] == first[1]
 
 
 def test_a_budget_bounds_the_epochs():
@@ -141,6 +165,8 @@ def test_data_that_were_not_there_may_come_but_not_change(tmp_path: Path):
     make_data(tmp_path / "data" / "clean", "oven", count=5, train=6)
     with pytest.raises(StoreError, match="differs in clean/oven/test"):
         freeze(path, plan_of(tmp_path))
+    shutil.rmtree(tmp_path / "data")  # another machine, where they are still to be made
+    assert not freeze(path, plan_of(tmp_path))
 
 
 @pytest.mark.parametrize("change", [{"budget_minutes": 99}, {"digest": "0" * 64}, {"format": "x"}])

@@ -17,9 +17,10 @@ from bench.requests import ReleaseRequest, Request
 from bench.runs import release as releasing
 from bench.runs.release import MAX_BYTES, answers_file, card_of, compare_answers, release
 from bench.scoring.evaluate import evaluate
-from scapo import predictor
+from scapo import released
 from scapo.alignment import Alignment
-from scapo.predictor import find, load
+from scapo.predictor import load
+from scapo.released import find
 from scapo.store import StoreError
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, read_checkpoint, write_checkpoint
 from scapo.types import Observation
@@ -29,7 +30,7 @@ from tests.helpers.placed import placed
 from tests.helpers.sighted import sighted
 from tests.helpers.tiny import TINY, tiny
 
-RELEASED = sorted(predictor._weights())
+RELEASED = sorted(released.weights())
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_a_release_is_half_as_large_and_answers_alike(folder: Path, monkeypatch)
     assert sizes[1] < 0.51 * sizes[0]
     assert all(array.dtype != np.float32 for array in after.values())
     assert header["source"] != ""
-    monkeypatch.setattr(predictor, "CHECKOUT", weights.parent.absolute())
+    monkeypatch.setattr(released, "CHECKOUT", weights.parent.absolute())
     points = np.random.default_rng(0).normal(size=(96, 3))
     here = load("laptop/scapo").predict(points)
     assert all(value.dtype == torch.float32 for value in load(weights).model.state_dict().values()
@@ -179,7 +180,7 @@ def test_registration_lets_go_of_clouds_that_nothing_looks_at():
 
 @pytest.mark.parametrize("name", RELEASED)
 def test_what_is_released_here_answers_as_it_did(name: str):
-    path = predictor._weights()[name]
+    path = released.weights()[name]
     assert path.stat().st_size <= MAX_BYTES
     assert path.with_suffix(".md").is_file()
     assert answers_file(path).is_file()
