@@ -23,10 +23,10 @@ from torch import Tensor, nn
 from bench.baselines.body import Body, Features
 from bench.baselines.supervised import LEAN, LearningConfig, SupervisedMethod
 from scapo.categories import Category
+from scapo.first_weights import uniform
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import gather, k_nearest, nearest
 from scapo.method import evenly
-from scapo.paper.vector_neurons import uniform
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

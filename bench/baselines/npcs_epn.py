@@ -26,6 +26,7 @@ from bench.baselines.npcs_network import Answer, NetworkConfig, NpcsNetwork
 from bench.baselines.similarity_ransac import Similarities, ransac
 from bench.baselines.supervised import Target, exchanged, states
 from scapo.categories import Category
+from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, gather, normalise
 from scapo.geometry.rigid import apply, invert, point_line_distance, random_rotations, rigid
 from scapo.method import (
@@ -38,7 +39,6 @@ from scapo.method import (
     changes,
     evenly,
 )
-from scapo.paper.vector_neurons import initialise
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 FEWEST = 8

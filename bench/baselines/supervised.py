@@ -26,12 +26,12 @@ from torch import Tensor, nn
 
 from bench.baselines.body import Block, Body, Features
 from scapo.categories import Category
+from scapo.first_weights import initialise
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import MEAN_RADIUS, gather, normalise
 from scapo.geometry.rigid import apply, invert, mean_rotation, random_rotations, rigid
 from scapo.geometry.rotations import rotmat_to_rotvec
 from scapo.method import AbstractMethod, Mode, Stage, Step, changes
-from scapo.paper.vector_neurons import initialise
 from scapo.registered.network import procrustes
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 

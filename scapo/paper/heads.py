@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
+from scapo.first_weights import uniform
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import farthest_points, k_means
-from scapo.paper.vector_neurons import uniform
 
 MOST_BLOCKS = 100  # Of any network: five are published
 

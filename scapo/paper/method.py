@@ -23,6 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import Category, JointKind
+from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
@@ -44,7 +45,6 @@ from scapo.paper.objectives import Explanation, articulation, canonicalisation
 from scapo.paper.part_search import PartSearch, Skeleton, motionless
 from scapo.paper.refine import nearest_template_weights, refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
-from scapo.paper.vector_neurons import initialise
 from scapo.paper.warm_start import WarmStart, imitation, load_run
 from scapo.pictures import PictureData
 from scapo.records import cat, map_tensors, take

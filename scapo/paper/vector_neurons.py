@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from scapo.first_weights import uniform
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import farthest_points, gather, k_nearest
 
@@ -24,29 +25,6 @@ NormForm = Literal["scale", "length"]
 
 TINY = 1e-12
 """Added under square roots of squared lengths, which are of the order of 1e-2 or more."""
-
-
-def uniform(parameter: Tensor, bound: float, generator: torch.Generator) -> None:
-    """Fill with numbers uniform in +-bound, drawn on the CPU so that every device starts alike."""
-    draw = torch.rand(parameter.shape, generator=generator, dtype=torch.float32)
-    with torch.no_grad():
-        parameter.copy_((2 * draw - 1) * bound)
-
-
-def initialise(module: nn.Module, generator: torch.Generator) -> None:
-    """Draw every weight below `module` anew, in the order of `modules()`.
-
-    Linear layers as PyTorch does, uniform in +-1/sqrt(inputs); a module of ours with a method
-    `reset(generator)` by that. Nothing touches the global random state.
-    """
-    for child in module.modules():
-        if isinstance(child, nn.Linear):
-            bound = child.in_features**-0.5
-            uniform(child.weight, bound, generator)
-            if child.bias is not None:
-                uniform(child.bias, bound, generator)
-        elif callable(reset := getattr(child, "reset", None)):
-            reset(generator)
 
 
 class Rectify(torch.autograd.Function):

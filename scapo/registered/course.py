@@ -38,7 +38,7 @@ FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 40.
 """A view that a first template is fitted to; an object beside its pairs; the first template of
 several objects; bundle adjustment after a search; a dense template; axes that deviate."""
 VIEW = 0.072  # A view that is searched
-TAUGHT = 0.08  # A view of an object that tells how objects stand
+OBJECT_VIEW = 0.08  # A view of an object that tells how objects stand
 BELIEF = 20.0  # Seconds of steps for which usual times count, beside those that were measured
 RECORDS: tuple[type[Any], ...] = (
     Candidate, Hypotheses, Inliers, JointProposal, Motion, OneObject, PartialViews, Placement,
@@ -85,7 +85,7 @@ def plan_of(
         plan |= dict.fromkeys(numbered("further object", further), pairs)
         shown = objects * config.object_views + further * config.further_views
         plan["search of objects"] = VIEW * AGREEING * shown
-        plan["how objects stand"] = TAUGHT * AGREEING * shown
+        plan["how objects stand"] = OBJECT_VIEW * AGREEING * shown
     plan["search of all views"] = VIEW * views
     return plan
 

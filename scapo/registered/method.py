@@ -29,9 +29,10 @@ from typing import ClassVar
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from scapo.categories import Category, JointKind
+from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
 from scapo.pictures import PictureData
@@ -118,11 +119,7 @@ class AbstractRegistered(AbstractMethod):
         kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         self.template = ArticulatedTemplate(kinds, config.discovery.final_points)
         self.network = PointVotes(len(category.parts), len(kinds), width=config.width)
-        for layer in self.network.modules():
-            if isinstance(layer, nn.Linear):
-                bound = layer.in_features**-0.5
-                for parameter in layer.parameters():
-                    nn.init.uniform_(parameter, -bound, bound, generator=generator)
+        initialise(self.network, generator)
         self.pseudo = PseudoLabels()
         self.orientation = OrientationScorer()
         self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None

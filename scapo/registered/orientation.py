@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from scapo.first_weights import initialise
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import take
 from scapo.registered.views import PartialViews
@@ -104,14 +105,7 @@ class OrientationScorer(nn.Module):
         self.hidden = nn.Linear(WIDTH, WIDTH)
         self.last = nn.Linear(WIDTH, 1)
         self.register_buffer("learned", torch.zeros(()))
-        self._reset(torch.Generator().manual_seed(0))
-
-    @torch.no_grad()
-    def _reset(self, generator: torch.Generator) -> None:
-        for layer in (self.surface, self.camera, self.hidden, self.last):
-            for parameter in layer.parameters():
-                drawn = torch.rand(parameter.shape, generator=generator) * 2 - 1
-                parameter.copy_(drawn * layer.in_features**-0.5)
+        initialise(self, torch.Generator().manual_seed(0))
 
     def forward(
         self, views: PartialViews, rotation: Float[Tensor, "B F 3 3"]
@@ -169,7 +163,7 @@ class OrientationScorer(nn.Module):
             generator: On the host.
             epochs: Over all of them.
         """
-        self._reset(generator)
+        initialise(self, generator)
         count = len(rotation)
         batches = [
             index for _ in range(epochs)

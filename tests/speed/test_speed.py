@@ -11,10 +11,11 @@ import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch import Tensor
 
+from scapo.first_weights import initialise
 from scapo.geometry import points
 from scapo.paper.autoencoder import Encoder, EncoderConfig
 from scapo.paper.skinning import Bones
-from scapo.paper.vector_neurons import VNBlock, initialise
+from scapo.paper.vector_neurons import VNBlock
 
 BATCH, POINTS, PARTS = 8, 1024, 2
 SAMPLES = 64

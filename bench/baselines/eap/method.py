@@ -21,6 +21,7 @@ from bench.baselines.eap.layers import EncoderConfig
 from bench.baselines.eap.parts import PartConfig, PartStage, Passed, Usual
 from bench.baselines.eap.whole import Whole, WholeConfig, WholeStage
 from scapo.categories import Category
+from scapo.first_weights import initialise
 from scapo.geometry.points import gather, nearest, normalise
 from scapo.geometry.rigid import rigid
 from scapo.method import (
@@ -35,7 +36,6 @@ from scapo.method import (
     evenly,
 )
 from scapo.paper.heads import thin
-from scapo.paper.vector_neurons import initialise
 from scapo.pictures import Panel, PictureData
 from scapo.types import Joints, Labels, Observation, Prediction
 

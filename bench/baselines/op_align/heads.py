@@ -18,10 +18,10 @@ from torch import Tensor, nn
 
 from scapo.categories import Category, JointKind
 from scapo.equivariant.layers import ChannelNorm
+from scapo.first_weights import uniform
 from scapo.geometry.numerics import at_least_float32, exact
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import MOST_BLOCKS, JointPairs, ResidualBlock, ZeroLinear
-from scapo.paper.vector_neurons import uniform
 
 
 def layers(*sizes: int, slope: float = 0.0) -> list[nn.Module]:

@@ -34,13 +34,13 @@ from bench.baselines.op_align.heads import (
     PointNetwork,
 )
 from scapo.categories import Category, JointKind
+from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, random_rotations, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, StepDecay, changes
 from scapo.paper.heads import JointPairs, thin
 from scapo.paper.losses import labelled_joints, labelled_segmentation, shape_variance, state_gauge
 from scapo.paper.skinning import cross_maps, part_maps
-from scapo.paper.vector_neurons import initialise
 from scapo.pictures import Panel, PictureData
 from scapo.types import Joints, Labels, Observation, Prediction
 

@@ -19,7 +19,7 @@ from bench.baselines.gcn3d import (
     graph,
     pooled,
 )
-from scapo.paper.vector_neurons import initialise
+from scapo.first_weights import initialise
 from tests.helpers.strategies import generator, normal, rotations
 
 

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from bench.baselines.npcs_epn import cpu_config
 from bench.baselines.npcs_network import NpcsNetwork
 from scapo.equivariant.anchors import icosahedron
-from scapo.paper.vector_neurons import initialise
+from scapo.first_weights import initialise
 from tests.helpers.small import settle
 from tests.helpers.strategies import generator, normal
 

@@ -18,8 +18,8 @@ from bench.baselines.pointnet2 import (
     interpolate,
     interpolation,
 )
+from scapo.first_weights import initialise
 from scapo.geometry.points import farthest_points, gather
-from scapo.paper.vector_neurons import initialise
 from tests.helpers.strategies import generator, normal
 
 

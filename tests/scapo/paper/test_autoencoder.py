@@ -10,8 +10,8 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
+from scapo.first_weights import initialise
 from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig, gram_schmidt
-from scapo.paper.vector_neurons import initialise
 from tests.helpers.strategies import generator, is_rotation, normal, rotations
 
 SMALL = EncoderConfig(neighbours=8, centres=24, pool=60, width=6, branch=(8, 12, 8, 6), features=7)

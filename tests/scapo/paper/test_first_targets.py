@@ -8,12 +8,12 @@ import torch
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES, JointKind
+from scapo.first_weights import initialise
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.first_targets import Inputs, first_targets, fit_networks, lying
 from scapo.paper.heads import JointNetwork, KeypointNetwork, ResidualNetwork
 from scapo.paper.part_search import Placements, Skeleton, T, having, posed, values
 from scapo.paper.skinning import Bones, cross_maps, deform, part_maps
-from scapo.paper.vector_neurons import initialise
 from tests.helpers.strategies import generator, normal
 from tests.helpers.tiny import TINY
 

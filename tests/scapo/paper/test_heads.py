@@ -10,8 +10,8 @@ import torch
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
+from scapo.first_weights import initialise
 from scapo.paper import heads as art
-from scapo.paper.vector_neurons import initialise
 from tests.helpers.strategies import generator, normal
 
 CONFIG = art.JointConfig(width=8, blocks=3, head=(8, 6))

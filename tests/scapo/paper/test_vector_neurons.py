@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from torch import nn
 from torch.testing import assert_close
 
+from scapo.first_weights import initialise
 from scapo.paper import vector_neurons as vn
 from tests.helpers.strategies import generator, normal, rotations, seeds
 
@@ -18,7 +19,7 @@ CHANNELS = 5
 
 def made(module: nn.Module, seed: int) -> nn.Module:
     """In double precision, with drawn weights and batch statistics of some data."""
-    vn.initialise(module, generator(seed))
+    initialise(module, generator(seed))
     module.double()
     for k in range(20):
         module(normal(seed + k, 40, 3, CHANNELS))
@@ -80,7 +81,7 @@ def test_initialise_repeats_and_leaves_the_global_state_alone() -> None:
         with torch.random.fork_rng(devices=[]):
             module = nn.Sequential(vn.VNBlock(3, 4), nn.Linear(4, 2))
         before = torch.get_rng_state()
-        vn.initialise(module, generator(seed))
+        initialise(module, generator(seed))
         assert torch.equal(before, torch.get_rng_state())
         return torch.cat([p.flatten() for p in module.parameters()])
 

@@ -19,10 +19,10 @@ from bench.baselines.eap.whole import WholeConfig
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron
 from scapo.equivariant.epn import SeparableBlock
+from scapo.first_weights import initialise
 from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply
 from scapo.method import Step, StepDecay
-from scapo.paper.vector_neurons import initialise
 from scapo.training.optimiser import learning_rate
 from scapo.types import Labels, Observation
 from tests.helpers.hinged import plates

@@ -22,7 +22,7 @@ from bench.baselines.op_align.heads import (
 )
 from bench.baselines.op_align.method import OpAlign, cpu_config
 from scapo.categories import CATEGORIES
-from scapo.paper.vector_neurons import initialise
+from scapo.first_weights import initialise
 from tests.helpers.strategies import generator, is_rotation, normal
 
 ANCHORS = torch.from_numpy(Rotation.create_group("I").as_matrix()).float()
