@@ -164,6 +164,9 @@ class PredictRequest(RunRequest):
     own_frame: bool = False
     """Leave poses, order of parts and states as a method that saw no poses has them, and not in
     the object's frame, where its checkpoint knows that."""
+    row: str = ""
+    """What tables call the training, in place of what it differs by from its method's usual one;
+    runs of one row of a table have one name. The mode is added to it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -252,7 +252,7 @@ class _Maker:
             clouds = self.count(split)
             predicted = self._predict(split, mode, part, name)
             if model is not None:
-                predicted = of_model(predicted, *model)
+                predicted = of_model(predicted, entry.label, *model)
             yield predicted, clouds
             best = seed == 1 and mode == entry.modes[-1]
             looked = LOOKED_AT if best and split.endswith("/test") else SCORED
@@ -329,10 +329,11 @@ def released_model(entry: Entry, part: str, category: str) -> tuple[str, Path] |
     return next(((name, known[name]) for name in names if name in known), None)
 
 
-def of_model(step: Step, name: str, path: Path) -> Step:
+def of_model(step: Step, row: str, name: str, path: Path) -> Step:
     """A prediction of a run, asked of a released model instead."""
     verb, _, *others = step.command
-    return replace(step, command=(verb, name, *others), needs=(), model=sha256_file(path))
+    command = (verb, name, *others, "--row", row)  # the models saw different labels: one row
+    return replace(step, command=command, needs=(), model=sha256_file(path))
 
 
 def own_preset(method: str, name: PresetName, own: str = "") -> tuple[str | None, Any]:

@@ -76,7 +76,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         started = time.perf_counter()
         parts.append(_answer(request, method, batch, device, alignment))  # waits for the device
         seconds += time.perf_counter() - started
-    words = [method.variant, "" if request.mode == "fast" else request.mode, *oracle]
+    words = [request.row or method.variant, "" if request.mode == "fast" else request.mode, *oracle]
     budget = {
         "device": device,
         "processor": _processor(device),

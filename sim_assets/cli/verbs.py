@@ -171,6 +171,7 @@ class Generate:
     def run(self, console: Console) -> int:
         """Make them, print a summary, and name the objects that failed."""
         from sim_assets.generation.generate import Running, make_split
+        from sim_assets.models.library import undivided
 
         started, kind = time.monotonic(), find(self.category, self.categories)
         with progress_bar(console) as show:
@@ -183,6 +184,10 @@ class Generate:
             )
             made = make_split(kind, self.data, self.out, running)
         show_made(console, made, time.monotonic() - started)
+        own = self.data.source != "procedural"
+        if own and (few := undivided(Path(self.data.source))):
+            say(console, f"note: too few models to divide ({few}): every split shows all of them, "
+                         "and scores say how well these are known, not others")  # fmt: skip
         return 1 if made.failed else 0
 
 

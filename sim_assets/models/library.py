@@ -142,6 +142,13 @@ def select(paths: Sequence[Path], split: str, root: Path) -> list[Path]:
     return chosen
 
 
+def undivided(source: Path) -> int:
+    """How many models a source has, if all of them are in every split; else 0."""
+    root, paths = source_root(source), find(source)
+    whole = len(paths) < FEW and not any(_own_split(path, root) for path in paths)
+    return len(paths) if whole else 0
+
+
 def _own_split(path: Path, root: Path) -> str | None:
     parts = path.parent.resolve().relative_to(root.resolve()).parts
     return next((part for part in parts if part in SPLITS), None)

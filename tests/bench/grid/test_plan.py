@@ -100,6 +100,7 @@ def test_a_released_model_is_asked_by_its_name(tmp_path: Path, monkeypatch):
             for split in ("test", "test-ood")
         }  # fmt: skip
         assert all(step.command[1] == name and not step.needs for step in asked)
+        assert all(step.command[-2:] == ("--row", "released") for step in asked)
         drawn = next(step for step in chain.steps if step.kind == "pictures")
         assert drawn.command[1] == name
     models["oven"].write_text("another")

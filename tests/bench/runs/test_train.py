@@ -183,7 +183,11 @@ def test_the_time_of_a_cloud_is_the_methods_alone(
 def test_icp_with_and_without_its_oracle(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "icp"
     command("train", "icp", "--category", "laptop", "--data", data, "--out", run, *FLAGS["icp"])
-    for words, variant in (((), ""), (("--oracle",), "oracle-segmentation")):
+    for words, variant in (
+        ((), ""),
+        (("--oracle",), "oracle-segmentation"),
+        (("--row", "mine", "--oracle"), "mine-oracle-segmentation"),
+    ):
         out = tmp_path / f"{variant}p.safetensors"
         command("predict", run, "--data", data, "--out", out, *words)
         header = read_prediction_header(out)

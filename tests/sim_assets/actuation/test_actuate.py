@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from scapo.parallel.pool import Outcome, Pool
 from scapo.store import Split, StoreError, open_split
 from scapo.store.actuations import read_actuations
 from scapo.store.predictions import Header, write_predictions
 from sim_assets.__main__ import main
+from sim_assets.actuation import actuate as room
 from sim_assets.actuation.actuate import NO_ANSWER, actuate, left_out, summary
 from sim_assets.generation.generate import Running, make_split
 from sim_assets.options import DataOptions
@@ -81,6 +85,21 @@ def test_what_is_written_is_what_was_found_and_the_same_again(data, tmp_path):
     assert first.needed == pytest.approx(min(30.0, (first.travel or 0) / 2), rel=1e-4)
     actuate(path, data, tmp_path / "few.csv", limit=2, running=HERE)
     assert read_actuations(tmp_path / "few.csv") == found[:2]
+
+
+def test_objects_that_are_pulled_in_another_order_change_nothing(data, tmp_path, monkeypatch):
+    """As several workers may end: the last object first."""
+
+    class Backwards(Pool[Any, Any]):
+        def run(self, *args: Any, **options: Any) -> Iterator[Outcome[Any, Any]]:
+            yield from reversed(list(super().run(*args, **options)))
+
+    path = predicted(open_split(data, "oven", "val"), tmp_path / "p.safetensors")
+    rows = actuate(path, data, tmp_path / "a.csv", running=HERE)
+    assert len({row.instance for row in rows}) == 2
+    monkeypatch.setattr(room, "open_pool", lambda *_, **__: Backwards(0))
+    actuate(path, data, tmp_path / "b.csv", running=HERE)
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
 @pytest.mark.slow

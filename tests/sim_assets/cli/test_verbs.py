@@ -160,6 +160,7 @@ def test_generate_names_the_models_it_left_out(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "laptop/train: 4 samples of 2 objects" in text
     assert f"left out {bad.parent.name}" in text
+    assert "note: too few models to divide (3): every split shows all of them" in text
     code = run(
         "generate", "laptop", "--source", source, "--out", tmp_path / "b", "--strict", *flags
     )

@@ -18,11 +18,13 @@ import pytest
 from scapo.store import Split, open_split
 from scapo.store.manifest import read_manifest
 from sim_assets import generate_samples
+from sim_assets.__main__ import main
 from sim_assets.generation.assets import ProceduralAsset
-from sim_assets.generation.generate import Made, Running, generate
-from sim_assets.generation.ledger import FINISHED, PLAN, GenerateError
+from sim_assets.generation.generate import Made, Running, generate, make_split
+from sim_assets.generation.ledger import FINISHED, PLAN, GenerateError, Ledger
 from sim_assets.generation.plan import Request
 from sim_assets.generation.request import make_request, versions
+from sim_assets.generation.shard import ShardDone
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import DataOptions
 from tests.helpers.boxes import laptop
@@ -277,6 +279,36 @@ def test_more_objects_are_tried_until_there_are_enough(tmp_path):
     assert [record.id for record in made.manifest.instances] == ["object1", "object3"]
     assert set(made.failed) == {"object0", "object2"}
     assert made.manifest.count == 10
+
+
+def test_interrupted_by_any_shard_it_is_taken_up_there_and_gives_the_same_bytes(
+    tmp_path, monkeypatch, capsys
+):
+    """Ctrl-C once each of the first two of three shards is recorded, then to the end."""
+    flags = ["generate", "laptop", "--protocol", "full", "--points", "64", "--workers", "0",
+             "--count", "192", "--instances", "3", "--out", str(tmp_path)]  # fmt: skip
+    recorded: list[str] = []
+
+    def record(ledger: Ledger, shard: ShardDone) -> None:
+        before(ledger, shard)
+        recorded.append(shard.file)
+        if len(recorded) < 3:
+            raise KeyboardInterrupt
+
+    before = Ledger.record
+    monkeypatch.setattr(Ledger, "record", record)
+    for _ in range(2):
+        with pytest.raises(SystemExit, match="130"):
+            main(flags)
+        assert capsys.readouterr().err.splitlines()[-1].endswith("takes it up where it was")
+        assert (tmp_path / "laptop/train" / PLAN).exists()
+        assert not (tmp_path / "laptop/train/manifest.json").exists()
+    with pytest.raises(SystemExit, match="0"):
+        main(flags)
+    assert recorded == [f"{i:05d}.safetensors" for i in range(3)]
+    options = DataOptions(protocol="full", points=64, count=192, instances=3)
+    whole = make_split("laptop", options, tmp_path / "whole", HERE)
+    assert content(tmp_path / "laptop/train") == content(whole.folder)
 
 
 @pytest.mark.slow

@@ -16,14 +16,28 @@ from sim_assets.generation.generate import Running, generate
 from sim_assets.options import DataOptions
 from sim_assets.generation.request import make_request, versions
 
-out, rounds, rng = Path(sys.argv[1]), int(sys.argv[2]), random.Random(sys.argv[3])
-options = DataOptions(protocol="full", points=512, count=400, instances=20)
+out, rounds, rng = Path(sys.argv[1]), int(sys.argv[2]), random.Random("1")
+points, count, instances = map(int, sys.argv[3:])
+options = DataOptions(protocol="full", points=points, count=count, instances=instances)
 request, assets = make_request("laptop", options)
 found = versions(request.settings.backend)
 started = time.monotonic()
 generate(request, assets, out / "whole", found, Running(workers=0))
 seconds = time.monotonic() - started
-kills = 0
+kills = renamed = 0
+rename = Path.replace
+
+
+def die_at_the_second_file(path, goal):
+    global renamed
+    renamed += 1
+    if renamed == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return rename(path, goal)
+
+
+if not rounds:
+    Path.replace = die_at_the_second_file
 while True:
     child = os.fork()  # what it needs is imported: it begins at once
     if child == 0:
@@ -39,14 +53,24 @@ while True:
     kills += 1
 print(kills)
 """
+"""Arguments: a folder; how often it is killed at random, 0: whenever it is about to put a second
+file in its place; points, samples and objects."""
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-def test_killed_at_random_instants_it_ends_with_the_same_bytes(tmp_path: Path, repository: Path):
-    """Up to twenty times; it is done earlier when enough was left by those before."""
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param((0, 64, 128, 2), id="at each file"),
+        pytest.param((20, 512, 400, 20), id="at random", marks=pytest.mark.slow),
+    ],
+)
+def test_killed_again_and_again_it_ends_with_the_same_bytes(
+    words: tuple[int, ...], tmp_path: Path, repository: Path
+):
+    """At random up to twenty times; it is done earlier when enough was left by those before."""
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", KILLED, str(tmp_path), "20", "1"],
+        [sys.executable, "-W", "ignore", "-c", KILLED, str(tmp_path), *map(str, words)],
         cwd=repository,
         capture_output=True,
         text=True,

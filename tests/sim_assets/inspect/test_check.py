@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from scapo.parallel.pool import Outcome, Pool
+from sim_assets.inspect import check as room
 from sim_assets.inspect.check import Options, check, check_one, exit_code, report, write_report
 from sim_assets.models.validate import AssetError
 from tests.helpers.urdfs import cabinet
@@ -70,14 +73,41 @@ def test_nothing_that_moves(tmp_path: Path):
     assert "travel" in result.reason
 
 
-@pytest.mark.slow
-def test_a_model_that_hangs_or_eats_the_memory(tmp_path: Path):
-    cabinet(tmp_path / "a", ("body.obj", "large.stl"))
-    count = 600_000
+def fine_body(folder: Path, count: int) -> None:
+    """A cabinet whose body has so many triangles."""
+    cabinet(folder, ("body.obj", "large.stl"))
     triangles = np.zeros(count, [("numbers", "<f4", 12), ("attribute", "<u2")])
     triangles["numbers"] = np.random.default_rng(0).normal(size=(count, 12))
     head = b"\0" * 80 + struct.pack("<I", count)
-    (tmp_path / "a/meshes/large.stl").write_bytes(head + triangles.tobytes())
+    (folder / "meshes/large.stl").write_bytes(head + triangles.tobytes())
+
+
+def test_a_model_that_is_given_too_little_memory(tmp_path: Path):
+    fine_body(tmp_path / "a", 60_000)
+    (starved,) = check(tmp_path, Options(memory=4 << 20))
+    assert starved.status == "refused"
+    assert "Memory" in starved.reason or "process" in starved.reason
+    assert check_one(tmp_path / "a/cabinet.urdf", tmp_path, Options()).status == "accepted"
+
+
+def test_a_model_of_which_nothing_is_heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Workers left out: they are said to be silent for as long as the options say."""
+
+    class Silent(Pool[Any, Any]):
+        def run(self, function: Any, jobs: Any, *_: Any, **__: Any) -> Iterator[Outcome[Any, Any]]:
+            reason = f"no sign of life for {self.timeout:g} s"
+            yield from (Outcome(job=j, result=None, failure="hung", reason=reason) for j in jobs)
+
+    monkeypatch.setattr(room, "Pool", Silent)
+    cabinet(tmp_path / "a")
+    (hung,) = check(tmp_path, Options(timeout=0.2))
+    wanted = "a/cabinet.urdf: expected to be read, found that no sign of life for 0.2 s"
+    assert (hung.status, hung.reason) == ("refused", wanted)
+
+
+@pytest.mark.slow
+def test_a_model_that_hangs_or_eats_the_memory(tmp_path: Path):
+    fine_body(tmp_path / "a", 600_000)
     hung = check(tmp_path, Options(timeout=0.2))
     assert [r.status for r in hung] == ["refused"]
     assert "no sign of life" in hung[0].reason

@@ -208,6 +208,26 @@ def test_names_from_files_are_text_in_a_browser(data: Path, tmp_path: Path):
         viewer.close()
 
 
+def test_the_server_has_cloud_object_and_controls(viewer: Viewer):
+    """What a browser is given to show; `near` of the test below sees it there."""
+    viewer.split_box.value = "laptop/train"
+    cloud, colors = viewer.scene.cloud[0], [bytes.fromhex(color[1:]) for color in PART_COLORS]
+    painted = [bytes(color) for color in np.asarray(cloud.colors, np.uint8)]
+    assert painted == [colors[part] for part in viewer.row["part"]]
+    assert set(painted) == set(colors[:2])
+    assert np.allclose(cloud.points, viewer.row["points"])
+    viewer.cloud_box.value = False
+    assert not cloud.visible
+    assert viewer.thing is not None
+    for handle, visual in zip(viewer.scene.meshes, sum(viewer.thing.visuals, ()), strict=True):
+        assert np.allclose(handle.vertices, visual.mesh.vertices)
+    assert viewer.joint_boxes[0].label == "screen (deg)"
+    assert [viewer.split_box.label, viewer.sample_box.label] == ["Data", "Sample"]
+    assert viewer.axes_box.label == "Joint axes"
+    assert "laptop-train-1-00000" in viewer.text.content
+    assert "base" in viewer.legend.content
+
+
 @pytest.mark.slow
 def test_chromium_shows_cloud_object_and_controls(viewer: Viewer, tmp_path: Path):
     viewer.split_box.value = "laptop/train"

@@ -8,7 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from sim_assets.models.library import SPLITS, find, hash_split, instance_id, select, source_root
+from sim_assets.models.library import (
+    SPLITS,
+    find,
+    hash_split,
+    instance_id,
+    select,
+    source_root,
+    undivided,
+)
 from sim_assets.models.validate import AssetError
 
 FIRST = ["test", "train", "train", "test"]
@@ -89,6 +97,9 @@ def test_few_models_are_not_divided(tmp_path: Path):
     paths = touch(tmp_path, *(f"{k}/mobility.urdf" for k in range(9)))
     for split in SPLITS:
         assert select(paths, split, tmp_path) == paths
+    assert undivided(tmp_path) == 9
+    touch(tmp_path, "9/mobility.urdf")
+    assert undivided(tmp_path) == 0
 
 
 def test_many_models_are_divided_by_hash(tmp_path: Path):
@@ -108,6 +119,7 @@ def test_own_splits_are_kept(tmp_path: Path):
     assert select(paths, "test", tmp_path) == paths[1:]
     with pytest.raises(AssetError, match="none of 2"):
         select(paths, "val", tmp_path)
+    assert undivided(tmp_path) == 0
     alone = touch(tmp_path / "train", "c/mobility.urdf")
     assert select(alone, "test", tmp_path / "train") == alone
 

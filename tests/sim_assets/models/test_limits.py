@@ -44,6 +44,30 @@ def measured(job: tuple[Path, str], report) -> tuple[str, float, int]:
     return reason, taken, 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
+LENGTHY = (
+    "glTF of 20,000 levels", "COLLADA of 60,000 instances", "20,000 equal spheres",
+    "20,000 spheres", "STL of 10 million faces", "STL of 60,000 solids", "OBJ of 10 million faces",
+    "OBJ of one line", "OBJ of 30 million vertices", "OBJ of 200,000 materials",
+    "a number of 30 MB", "2,000 mimics in a row",
+)  # fmt: skip
+"""Refused no earlier than when they have taken much time or memory."""
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name not in LENGTHY])
+def test_most_are_refused_in_one_line_at_once(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(limits, "READ_SECONDS", 0.4)
+    monkeypatch.setattr(limits, "TICK", 0.1)
+    MODELS[name](tmp_path)
+    begun = time.process_time()
+    with pytest.raises(AssetError, match="expected") as refused:
+        read(tmp_path / "cabinet.urdf", "oven", root=tmp_path)
+    assert time.process_time() - begun < 2
+    assert len(str(refused.value)) < 1500
+    assert str(refused.value).isprintable()
+
+
 @pytest.mark.slow
 def test_each_is_refused_in_one_line_within_bounds(tmp_path: Path):
     for number, (_, make) in enumerate(MODELS.items()):
