@@ -19,7 +19,7 @@ from bench.requests import PredictRequest
 from bench.runs import predict as predicting
 from bench.runs.train import pick_device
 from bench.scoring.scores import to_arrays
-from scapo import predictor
+from scapo import released
 from scapo.method import OracleMethod
 from scapo.paper.method import Scapo
 from scapo.store import open_split
@@ -149,7 +149,7 @@ def test_no_clouds_are_refused(
 def test_a_released_model_is_asked_by_its_category(
     run: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(predictor, "_weights", lambda: {"laptop": run / "checkpoint.safetensors"})
+    monkeypatch.setattr(released, "weights", lambda: {"laptop": run / "checkpoint.safetensors"})
     monkeypatch.chdir(tmp_path)
     command("predict", "laptop", "--data", data, "--out", "named.safetensors", "--device", "cpu")
     command("predict", run, "--data", data, "--out", "run.safetensors", "--device", "cpu")
