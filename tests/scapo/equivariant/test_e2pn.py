@@ -6,14 +6,16 @@ from __future__ import annotations
 import copy
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.testing import assert_close
 
 from scapo.equivariant.anchors import icosahedron, turned
 from scapo.equivariant.e2pn import ORBITS, QuotientBlock, QuotientConv, orbits, to_rotations
+from scapo.equivariant.epn import SeparableBlock
 from scapo.equivariant.levels import (
     SIGMA,
     LevelConfig,
@@ -22,6 +24,7 @@ from scapo.equivariant.levels import (
     levels,
     neighbourhood,
 )
+from scapo.records import map_tensors
 from tests.helpers.strategies import normal
 
 GROUP = icosahedron()
@@ -124,6 +127,21 @@ def test_recomputed_correlations_change_no_gradient() -> None:
         assert conv.linear.weight.grad is not None
         found.append((x.grad, conv.linear.weight.grad))
     assert_close(found[0], found[1])
+
+
+@pytest.mark.parametrize(("kind", "anchors"), [(SeparableBlock, 60), (QuotientBlock, 12)])
+def test_blocks_ask_no_tensor_for_its_values(
+    kind: Callable[[int, int], nn.Module], anchors: int
+) -> None:
+    """Which would cut a compiler's graph in two: these have none to tell."""
+    near = neighbourhood(normal(0, 1, 9, 3).float(), torch.tensor([[0, 5]]), 1.4, 4)
+    block = kind(2, 3).to("meta")
+    x = torch.zeros(1, 9, anchors, 2, device="meta", requires_grad=True)
+    out = block(x, map_tensors(near, lambda one: one.to("meta")))
+    out.square().sum().backward()
+    assert out.shape == (1, 2, anchors, 3)
+    assert x.grad is not None
+    assert (out.is_meta, x.grad.is_meta) == (True, True)
 
 
 @pytest.mark.slow

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -41,6 +43,26 @@ def test_the_graph_gives_the_votes_for_any_number_of_clouds():
         wanted = made(clouds(count))
         for name, found in zip(PlainVotes.OUTPUTS, graph(clouds(count)), strict=True):
             assert_close(found, getattr(wanted, name), atol=1e-4, rtol=0)
+
+
+@torch.no_grad()
+def test_the_file_is_the_graph_with_named_outputs_as_the_exporter_gives_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """The exporter left out: it comes with the extra."""
+    asked: dict[str, Any] = {}
+
+    def exporting(program: Any, **options: Any) -> SimpleNamespace:
+        asked.update(options, program=program)
+        return SimpleNamespace(model_proto=SimpleNamespace(SerializeToString=lambda: b"a graph"))
+
+    monkeypatch.setattr(torch.onnx, "export", exporting)
+    layer, path = torch.nn.Linear(3, 2), tmp_path / "votes.onnx"
+    write_onnx(layer, clouds(2), ("votes",), path)
+    assert path.read_bytes() == b"a graph"
+    assert (asked["input_names"], asked["output_names"]) == (["cloud"], ["votes"])
+    for count in (1, 4):
+        assert_close(asked["program"].module()(clouds(count)), layer(clouds(count)))
 
 
 @pytest.mark.slow

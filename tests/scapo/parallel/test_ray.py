@@ -8,17 +8,18 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from scapo.parallel import ray as engine
-from scapo.parallel.pool import Pool
+from scapo.parallel.pool import Outcome, Pool
 from scapo.parallel.ray import MAX_LOST, MISSING, RayPool, open_pool
 from scapo.store import Split
 from sim_assets.__main__ import main
@@ -26,6 +27,7 @@ from sim_assets.generation import generate as generating
 from sim_assets.generation.generate import Made, Running, generate
 from sim_assets.generation.ledger import GenerateError, Ledger
 from sim_assets.generation.request import make_request, versions
+from sim_assets.generation.shard import ShardJob
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import DataOptions
 from tests.helpers.boxes import laptop
@@ -66,6 +68,80 @@ def suicide(job: int, report) -> int:
     os.kill(os.getppid(), signal.SIGKILL)
     time.sleep(60)
     return job
+
+
+class NodeDiedError(Exception):
+    """What the stand-in for Ray raises."""
+
+
+class StandIn:
+    """In place of the package: a task is done here once it is listened to, the oldest first.
+
+    Some lose their machine when they have ended, before their outcome is heard.
+    """
+
+    exceptions = SimpleNamespace(RayError=NodeDiedError, RayTaskError=ZeroDivisionError)
+
+    def __init__(self, loses: Callable[[Any], bool]) -> None:
+        self.loses = loses
+
+    def is_initialized(self) -> bool:
+        return True
+
+    def cluster_resources(self) -> dict[str, float]:
+        return {"CPU": 1.0}
+
+    def remote(self, **_: object) -> Any:
+        return lambda task: SimpleNamespace(
+            remote=lambda *job: self._stream(task(*job), self.loses(job[1]))
+        )
+
+    def _stream(self, messages: Iterator[Any], lost: bool) -> Iterator[Any]:
+        for message in messages:
+            if lost and isinstance(message, Outcome):
+                raise NodeDiedError
+            yield message
+
+    def wait(self, streams: list[Any], **_: object) -> tuple[list[Any], list[Any]]:
+        return streams[:1], []
+
+    def get(self, message: object) -> object:
+        return message
+
+    def cancel(self, stream: Iterator[Any], *, force: bool) -> None:
+        del stream, force
+
+
+@pytest.fixture
+def losing(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any], bool]], None]:
+    """Put the stand-in in the place of Ray; jobs are done in this process."""
+    monkeypatch.setattr(engine, "_pool", lambda timeout, gpus: Pool[Any, Any](0, timeout=timeout))
+    return lambda loses: monkeypatch.setattr(engine, "find_ray", lambda: StandIn(loses))
+
+
+def test_what_is_lost_is_done_again_and_given_up_where_it_always_is(losing):
+    left = {("square", 2): 1, ("square", 4): MAX_LOST}
+
+    def loses(job: tuple[str, int]) -> bool:
+        left[job] = left.get(job, 0) - 1
+        return left[job] >= 0
+
+    losing(loses)
+    jobs = [("square", 1), ("square", 2), ("raise", 3), ("square", 4)]
+    heard: dict[str, int] = {}
+
+    def hear(job: tuple[str, int], label: str, amount: int) -> None:
+        heard[label] = heard.get(label, 0) + amount
+
+    with RayPool[Any, Any]() as pool, Pool[Any, Any](0) as local:
+        outcomes = {outcome.job: outcome for outcome in pool.run(act, jobs, hear)}
+        alike = {outcome.job: outcome for outcome in local.run(act, jobs[:3])}
+    killed = outcomes.pop(("square", 4))
+    assert outcomes == alike
+    assert (killed.failure, killed.result, killed.label) == ("died", None, "square 4")
+    assert killed.reason == f"its machine or worker was lost {MAX_LOST} times (NodeDiedError)"
+    assert pool.lost == 1 + MAX_LOST - 1
+    assert heard == {"square 1": 1, "square 2": 1, "raise 3": 1, "square 4": 1}
 
 
 @with_ray
@@ -151,6 +227,39 @@ def kill_node(cluster: Any, raylet: int) -> None:
     for node in cluster.worker_nodes.copy():
         if node.all_processes["raylet"][0].process.pid == raylet:
             cluster.remove_node(node, allow_graceful=False)
+
+
+def test_machines_lost_with_finished_shards_lose_and_double_nothing(losing, tmp_path, monkeypatch):
+    """Each object and each shard is made twice, since the first machine is never heard of again."""
+    options = DataOptions(protocol="full", points=64, count=128, instances=2)
+    request, assets = make_request("laptop", options)
+    found = versions(request.settings.backend)
+    local = generate(request, assets, tmp_path / "local", found, Running(workers=0))
+    begun: list[str] = []
+    recorded: list[str] = []
+    done: list[tuple[str, int]] = []
+
+    def loses(job: Any) -> bool:
+        begun.append(job.plan.file if isinstance(job, ShardJob) else job.name)
+        return begun.count(begun[-1]) == 1
+
+    def record(ledger: Ledger, shard) -> None:
+        recorded.append(shard.file)
+        before(ledger, shard)
+
+    before = Ledger.record
+    monkeypatch.setattr(Ledger, "record", record)
+    losing(loses)
+    running = Running(
+        workers=None, engine="ray", progress=lambda what, n, _: done.append((what, n))
+    )
+    made = generate(request, assets, tmp_path / "ray", found, running)
+    objects, shards = [asset.name for asset in assets], ["00000.safetensors", "00001.safetensors"]
+    assert sorted(begun) == sorted(2 * (objects + shards))
+    assert recorded == shards
+    assert max(done) == done[-1] == ("samples", 128)
+    assert made.failed == {}
+    assert content(made.folder) == content(local.folder)
 
 
 @with_ray

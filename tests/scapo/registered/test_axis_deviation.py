@@ -11,6 +11,7 @@ import torch
 from torch.testing import assert_close
 
 from scapo.records import take
+from scapo.registered import axis_deviation
 from scapo.registered.axis_deviation import (
     REACHES,
     deviating_templates,
@@ -22,6 +23,7 @@ from scapo.registered.axis_deviation import (
 )
 from scapo.registered.bundle_adjustment import Candidate, FitOptions, Inliers
 from scapo.registered.config import DiscoveryConfig
+from scapo.registered.pose_search import SearchResult
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
@@ -61,6 +63,34 @@ def test_parts_are_posed_as_rotated_about_their_pivot() -> None:
     assert_close(poses.rotation[:, 0], straight.rotation[:, 0])
 
 
+@pytest.mark.parametrize("deviation", [0.3, 0.0])
+def test_a_deviating_template_is_taken_where_held_out_views_deviate_and_tells_how(
+    deviation: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The judging alone: one that deviates is at hand, and the judges' placements are known.
+
+    Templates that were fitted explain far more than these, so that less gain is asked for here.
+    """
+    views, truth = sighted(8, seed=5, deviation=deviation)
+    straight = replace(truth, deviation=torch.zeros_like(truth.deviation))
+    inliers = Inliers(views=views, placement=straight)
+    start, other = Candidate(template=template(count=1500), inliers=inliers), template(count=1500)
+    other.load.copy_(torch.tensor([0.0, 0.3]))  # as of the true one, which rests at state 0
+    other.noise.copy_(1e-4 * torch.eye(2))
+    placed = SearchResult(placement=straight, loss=torch.zeros(8), margin=torch.zeros(8))
+    monkeypatch.setattr(
+        axis_deviation, "deviating_templates", lambda *_: [replace(start, template=other)]
+    )
+    monkeypatch.setattr(axis_deviation, "search_views", lambda *_: placed)
+    monkeypatch.setattr(axis_deviation, "LEAST_GAIN", 0.04)
+    found = with_axis_deviation(start, views, DiscoveryConfig(), generator(0)).template
+    assert found is (other if deviation else start.template)
+    at, _ = refine_deviations(found, views, straight)
+    got, true = (one.rotation @ found.own_directions(one).mT for one in (at, truth))
+    angle = torch.rad2deg((got * true).sum(1).clamp(max=1).arccos())
+    assert angle.mean() < 2 / 3 * torch.rad2deg(torch.tensor(0.3))
+
+
 @pytest.mark.slow
 def test_axes_that_deviate_are_found_and_told() -> None:
     views, truth = sighted(48, seed=8, deviation=ASIDE)
@@ -79,6 +109,16 @@ def test_axes_that_deviate_are_found_and_told() -> None:
     assert angle.mean() < 2 / 3 * torch.rad2deg(torch.tensor(ASIDE))
     _, before = refine_deviations(template(), take(views, held), take(straight, held))
     assert loss.mean() < before.mean()
+
+
+def test_templates_deviate_where_a_few_views_do_and_there_alone() -> None:
+    for deviation in (0.0, ASIDE):
+        views, truth = sighted(8, seed=9, deviation=deviation)
+        straight = replace(truth, deviation=torch.zeros_like(truth.deviation))
+        start = Candidate(template=template(), inliers=Inliers(views=views, placement=straight))
+        made = deviating_templates(start, FitOptions(steps=1), generator(0))
+        assert bool(made) == (deviation > 0)
+        assert all(one.template.deviates() for one in made)
 
 
 @pytest.mark.slow

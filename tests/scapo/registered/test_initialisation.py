@@ -17,16 +17,17 @@ from tests.helpers.sliding import OUT, UP, cabinet, placements, seen
 from tests.helpers.strategies import generator
 
 
-@pytest.mark.slow
-def test_a_drawer_at_different_heights_slides_out_not_up():
-    truth = placements(24)
+@pytest.mark.parametrize(("count", "starts"), [(8, 1), pytest.param(24, 2, marks=pytest.mark.slow)])
+def test_a_drawer_at_different_heights_slides_out_not_up(count: int, starts: int):
+    truth = placements(count)
     truth = replace(
         truth, shift=truth.shift + 0.6 * truth.state[..., None] * UP, state=0 * truth.state
     )
     views = seen(cabinet(OUT, 7, 4000), truth)
     posed = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
-    tried = fitted_proposals(posed, ("prismatic",), DiscoveryConfig(starts=2), generator(0))
-    assert len(tried) == 2
+    config = DiscoveryConfig(starts=starts)
+    tried = fitted_proposals(posed, ("prismatic",), config, generator(0))
+    assert len(tried) == starts
     for candidate in tried:
         assert axis_angle(candidate.template.directions()[0].detach(), OUT).rad2deg() < 10
         state = candidate.inliers.placement.state[:, 0]

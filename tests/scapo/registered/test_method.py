@@ -80,9 +80,12 @@ def distance_to_template(prediction: Prediction, observation: Observation) -> Te
     return squared_distances(canonical, prediction.canonical_points).sqrt().mean(-1)
 
 
-@pytest.mark.slow
-def test_refinement_brings_the_template_closer():
-    method, observation = trained(150)
+@pytest.mark.parametrize(
+    ("steps", "count"), [(0, 3), pytest.param(150, 12, marks=pytest.mark.slow)]
+)
+def test_refinement_brings_the_template_closer(steps: int, count: int):
+    method, observation = trained(steps)
+    observation = Observation(points=observation.points[:count])
     refined = method.predict(observation, "refine")
     fast = method.predict(observation)
     after, before = (distance_to_template(one, observation) for one in (refined, fast))

@@ -11,7 +11,8 @@ import torch
 
 from scapo.categories import CATEGORIES
 from scapo.geometry.rigid import axis_angle, random_rotations, rotation_angle
-from scapo.registered import method
+from scapo.registered import joint_proposals, method
+from scapo.registered import objects as room
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.joint_proposals import JointProposal, PosedViews
@@ -144,6 +145,38 @@ def test_views_of_one_object_outvote_turns_that_single_views_prefer() -> None:
     rotation[3] = random_rotations(4, g)  # a view none of whose hypotheses is right
     turned = replace(hypotheses, placement=replace(placement, rotation=rotation.flatten(0, 1)))
     assert voted(turned, limits, shown)[1].tolist() == [True] * 3 + [False] + [True] * 6
+
+
+def test_views_of_one_object_tell_its_frame_and_its_axis(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joint_proposals, "PAIRS", 30)
+    views, truth = sighted(6, seed=0)
+    found = one_object(views, ("revolute",), DiscoveryConfig(rotations=200), generator(0))
+    which = torch.cdist(found.posed.views.points[:, 0], views.points[:, 0]).argmin(1)
+    common = found.posed.rotation.mT @ truth.rotation[which]
+    off = rotation_angle(common, common[:1].expand_as(common))
+    assert float((off.rad2deg() < 20).float().mean()) > 0.8
+    axis = found.proposals[0][0].axis
+    assert float(axis_angle(axis, common[0] @ AXIS).rad2deg()) < 15
+
+
+def test_a_template_of_objects_in_turned_frames_is_in_one_frame(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What each object tells is known; some of their views, a fit of few points."""
+    monkeypatch.setattr(room, "FITTED", 8)
+    some = [known(quarter_turns()[5 * k], k, (0.2, 0.1, 0.1)) for k in range(4)]
+    config = DiscoveryConfig(template_points=100)
+    found = object_candidate(some, ("revolute",), config, generator(0))
+    shown = [sighted(6, seed=k) for k in range(4)]
+    points = torch.cat([views.points[:, 0] for views, _ in shown])
+    which = torch.cdist(found.inliers.views.points[:, 0], points).argmin(1)
+    truth = torch.cat([placement.rotation for _, placement in shown])[which]
+    common = found.inliers.placement.rotation.mT @ truth
+    off = rotation_angle(common, common[:1].expand_as(common))
+    assert len(off) == 8
+    assert float((off.rad2deg() < 25).float().mean()) > 0.7
+    axis = found.template.directions()[0].detach()
+    assert float(axis_angle(axis, common[0] @ AXIS).rad2deg()) < 15
 
 
 @pytest.mark.slow

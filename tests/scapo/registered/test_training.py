@@ -15,14 +15,17 @@ from scapo.categories import CATEGORIES
 from scapo.method import Journal
 from scapo.predictor import load
 from scapo.registered import discovery
+from scapo.registered import method as room
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.method import TemplateRegistration
+from scapo.registered.orientation import OrientationScorer
+from scapo.registered.pose_search import SearchResult
 from scapo.store.samples import TrainingData
 from scapo.training import fit
 from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation
-from tests.helpers.sighted import sighted
+from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 from tests.scapo.training.test_fit import InterruptedRunError, same
 
@@ -49,6 +52,39 @@ def clouds(count: int) -> Observation:
 
 def method(config: RegisteredConfig = CONFIG) -> TemplateRegistration:
     return TemplateRegistration(config, CATEGORIES["oven"], generator(0))
+
+
+def test_a_template_at_hand_is_learned_stored_and_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of a training but the discovery, in place of which the truth is; a kill in between."""
+    _, truth = sighted(10, seed=80)
+    none = torch.zeros(10)
+    made = Discovery(
+        template=template(count=240),
+        found=SearchResult(placement=truth, loss=none, margin=none),
+        scorer=OrientationScorer(),
+    )
+    monkeypatch.setattr(room, "discover", lambda *_: made)
+    data = TrainingData(observation=clouds(10), labels=Labels(), digest="here")
+    config = replace(CONFIG, learned=10)
+
+    def stopping(progress: fit.Progress) -> None:
+        if progress.epoch == 1:
+            raise InterruptedRunError
+
+    fit.fit(method(config), data, tmp_path / "whole", RUN)
+    with pytest.raises(InterruptedRunError):
+        fit.fit(method(config), data, tmp_path / "cut", RUN, listener=stopping)
+    fit.fit(method(config), data, tmp_path / "cut", RUN, resume=True)
+    same(tmp_path / "whole", tmp_path / "cut")
+    learned = load(tmp_path / "whole")
+    one = learned.predict(data.observation.points[0], "refine")
+    assert one.part_weight.shape == (data.observation.points.shape[1], 2)
+    assert isinstance(learned.model, TemplateRegistration)
+    assert torch.equal(learned.model.template.points, made.template.points)
+    kept = learned.model.pseudo.placement().rotation
+    assert all(bool((row == truth.rotation).all((1, 2)).any()) for row in kept)
 
 
 @pytest.mark.slow

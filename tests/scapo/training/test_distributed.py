@@ -7,13 +7,18 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch.nn.utils import parameters_to_vector
 
+from bench.__main__ import main
+from bench.runs import train as training
+from scapo.method import AbstractMethod
 from scapo.store.checkpoint import TRAINING, WEIGHTS, read_checkpoint
 from scapo.store.files import read
 from scapo.store.schema import StoreError
@@ -120,6 +125,30 @@ def test_nan_on_one_rank_stops_all_with_its_batch(folder: Path, said: list[dict[
 def test_another_number_of_ranks_does_not_resume(folder: Path) -> None:
     with pytest.raises(StoreError, match=r'training: expected .*"ranks":1.* to resume, found'):
         fit.fit(Line(), tiny_data(), folder / "line", CONFIG, resume=True)
+
+
+def test_the_second_process_of_a_command_trains_and_says_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """This process in its place, the first left out; what that one writes: `test_train`."""
+    second, moved = Ranks(rank=1), list[bool]()
+
+    def watched(method: AbstractMethod, *args: Any, **options: Any) -> None:
+        before = parameters_to_vector(method.parameters())
+        trained(method, *args, **options)
+        moved.append(not torch.equal(parameters_to_vector(method.parameters()), before))
+
+    trained = fit.fit
+    monkeypatch.setattr(fit, "fit", watched)
+    monkeypatch.setattr(fit, "present", lambda: second)
+    monkeypatch.setattr(Ranks, "share", lambda _, index: index)
+    monkeypatch.setattr(training, "joined", lambda device: nullcontext(second))
+    made.make_data(tmp_path / "data", train=16)
+    words = ["train", "scapo", "--category", "laptop", "--device", "cpu", *SMALL]
+    main([*words, "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")])
+    assert capsys.readouterr() == ("", "")
+    assert moved == [True]
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -21,6 +23,7 @@ from scapo.paper.method import Scapo
 from scapo.store.checkpoint import TRAINING, WEIGHTS
 from scapo.store.files import read_header
 from scapo.training import fit
+from scapo.training import precision as precision_module
 from scapo.training.precision import Arithmetic, Precision, applied, full
 from scapo.types import Labels, Observation
 from tests.conftest import REPOSITORY
@@ -136,6 +139,29 @@ def test_only_half_precision_is_widened() -> None:
     assert full(double) is double
     half, number = full((torch.zeros(1, dtype=torch.float16), torch.zeros(1, dtype=torch.long)))
     assert (half.dtype, number.dtype) == (torch.float32, torch.long)
+
+
+def test_every_network_is_handed_to_the_compiler_and_put_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A stand-in for the compiler, which adds one to what `Line` says."""
+    asked: list[dict[str, Any]] = []
+
+    def compiling(forward: Callable[[Tensor], Tensor], **options: Any) -> Callable[..., Tensor]:
+        asked.append(options)
+        return lambda points: forward(points) + 1
+
+    monkeypatch.setattr(torch, "compile", compiling)
+    monkeypatch.setattr(precision_module, "before_compiling", lambda: None)
+    method = Line()
+    before = method.map(CLOUDS)
+    with applied(method, Arithmetic(compiled=True), "cpu"):
+        within = method.map(CLOUDS)
+    assert asked == [{"mode": "default", "dynamic": False}]
+    assert torch.equal(within, before + 1)
+    assert torch.equal(method.map(CLOUDS), before)
+    with applied(method, Arithmetic(), "cpu"):
+        assert torch.equal(method.map(CLOUDS), before)
 
 
 COMPILED = """
