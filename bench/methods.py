@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scapo.registry import LIBRARY, Method, known, load_method
+from scapo.released import find as find_checkpoint
 
 if TYPE_CHECKING:
     from scapo.method import AbstractMethod
@@ -57,5 +58,9 @@ def find(name: str) -> Method | None:
 
 
 def load(run: Path) -> tuple[AbstractMethod, Header]:
-    """The trained method of a run folder or checkpoint file; see `scapo.registry.load_method`."""
-    return load_method(run, all_methods())
+    """The trained method of a run folder, checkpoint file or name of a released model.
+
+    Raises:
+        StoreError: As `scapo.released.find` and `scapo.registry.load_method`.
+    """
+    return load_method(find_checkpoint(run), all_methods())

@@ -134,7 +134,7 @@ class RunRequest:
     """A trained method and the data it is shown."""
 
     checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Run folder, or a checkpoint file."""
+    """Run folder, checkpoint file, or name of a released model, such as a category."""
     data: Path
     """Data set: the folder above CATEGORY/SPLIT, or above that of a benchmark."""
 
@@ -143,8 +143,6 @@ class RunRequest:
 class PredictRequest(RunRequest):
     """What to predict, and how."""
 
-    checkpoint: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """Run folder, checkpoint file, or category with a released model."""
     out: Path
     """Predictions file, NAME.safetensors."""
     split: str = "test"

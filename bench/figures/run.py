@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from bench.methods import load
 from bench.requests import PicturesRequest, Request
 from bench.run_files import METRICS
 from scapo.method import AbstractMethod, evenly
+from scapo.released import find as find_checkpoint
 from scapo.store import StoreError
 from scapo.store.checkpoint import check_header
 from scapo.store.files import Header
@@ -32,6 +34,7 @@ def draw_pictures(request: PicturesRequest) -> Iterator[str]:
     Raises:
         StoreError: No checkpoint, no such data, or predictions of another run.
     """
+    request = replace(request, checkpoint=find_checkpoint(request.checkpoint))
     method, header = load(request.checkpoint)
     answered = read_answered(
         Request(

@@ -155,6 +155,9 @@ def test_a_released_model_is_asked_by_its_category(
     command("predict", run, "--data", data, "--out", "run.safetensors", "--device", "cpu")
     for name, value in read(tmp_path / "run.safetensors")[0].items():
         np.testing.assert_array_equal(value, read(tmp_path / "named.safetensors")[0][name])
+    words = ("--predictions", "named.safetensors", "--clouds", 2, "--out", "drawn")
+    command("pictures", "laptop", "--data", data, *words)
+    assert (tmp_path / "drawn/ranking.png").is_file()
 
 
 def test_the_time_of_a_cloud_is_the_methods_alone(
