@@ -186,6 +186,7 @@ def densified(
             placement = choose_axes(dense, placement, torch.eye(3))
         options = late_options(dense, config)
         placement, _ = bundle_adjust(dense, views, placement, options, generator=generator)
+    placement = settle_hinges(dense, placement, touching=True)
     return Candidate(template=dense, inliers=Inliers(views=views, placement=placement))
 
 

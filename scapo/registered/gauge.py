@@ -43,7 +43,12 @@ REWEIGHTED, SPREAD = 10, 0.04
 """Rounds of robust least squares, and the shift (normalised length) beyond which a view counts
 less."""
 SEAT = 0.15  # Share of a part's points, those nearest to its axis, that tell where its pivot sits
-LOOSE = 3e-4  # Pull of a hinge to its place, per view: what the views leave open stays
+LOOSE, TOUCHING = 3e-4, 1.0
+"""Pull of a hinge to its place, per view, so that what the views leave open stays; and to where its
+part touches the base: shifts alone hold it by 0.05 to 0.2."""
+NEAREST = 0.02  # Share of a part's points that must be near where it touches; strays are fewer
+TOUCH_REACH, TOUCH_STEP = 0.3, 0.01  # Half side and step of the grid that is looked at
+ASTRAY = 0.1  # Squared distance from where the hinge was, beside those to the parts
 
 
 @torch.no_grad()
@@ -221,13 +226,21 @@ def _turned_to(
 
 
 @torch.no_grad()
-def settle_hinges(template: ArticulatedTemplate, placement: Placement) -> Placement:
+def settle_hinges(
+    template: ArticulatedTemplate, placement: Placement, *, touching: bool = False
+) -> Placement:
     """Put every hinge where the observed motions of its part leave the least shift, in place.
 
     A part that turns about one axis and is then shifted across it has turned about another, which
     is parallel. While every object's hinge may sit elsewhere on its body, which of them is the
     category's is open: it is that about which the shifts of all views are smallest (robust least
     squares), with a constant displacement that the part's points take over.
+
+    Args:
+        template: Pivots and points of parts change.
+        placement: Of the views that it was fitted to.
+        touching: Where sizes differ between objects, and shifts with them, even that is nearly
+            open. Of made things the two parts of a hinge touch at it: pull it there.
 
     Returns:
         The same motions as turns about the new hinges, with the shifts that are left.
@@ -243,8 +256,10 @@ def settle_hinges(template: ArticulatedTemplate, placement: Placement) -> Placem
         across = across_axis(axis)
         both = torch.cat([lever, turn], -1) * scale.repeat(1, 2)[:, None]
         column = across @ both @ torch.block_diag(across.T, across.T)
-        start = torch.cat([across @ template.pivot[j], torch.zeros(2).to(scale)])
-        found = _robust_least_squares(column, move @ across.T, start)
+        goal = touch(template, j) if touching else template.pivot[j]
+        start = torch.cat([across @ goal, torch.zeros(2).to(scale)])
+        hold = torch.tensor([TOUCHING if touching else LOOSE] * 2 + [LOOSE] * 2).to(scale)
+        found = _robust_least_squares(column, move @ across.T, start, hold)
         pivot, moved = found[:2] @ across, found[2:] @ across
         template.pivot[j] = pivot + (template.pivot[j] @ axis) * axis
         template.points.add_(template.logit.softmax(-1)[:, j + 1, None] * moved)
@@ -253,16 +268,40 @@ def settle_hinges(template: ArticulatedTemplate, placement: Placement) -> Placem
     return replace(placement, shift=shift)
 
 
+@torch.no_grad()
+def touch(template: ArticulatedTemplate, joint: int) -> Float[Tensor, " 3"]:
+    """The point across a hinge's axis to which its part and the base both come nearest.
+
+    Both are seen along the axis, so where they overlap the hinge stays.
+    """
+    across = across_axis(template.directions()[joint])
+    own, pivot = template.logit.argmax(-1), template.pivot[joint]
+    seen = [template.points[own == label] @ across.T for label in (0, joint + 1)]
+    if not all(map(len, seen)):
+        return pivot
+    steps = torch.arange(-TOUCH_REACH, TOUCH_REACH + TOUCH_STEP / 2, TOUCH_STEP).to(pivot)
+    away = torch.cartesian_prod(steps, steps)
+    cost = ASTRAY * away.square().sum(-1)
+    for points in seen:
+        count = max(1, round(NEAREST * len(points)))
+        distance = torch.cdist(across @ pivot + away, points)
+        cost = cost + distance.kthvalue(count, dim=1).values.square()
+    return pivot + away[cost.argmin()] @ across
+
+
 def _robust_least_squares(
-    column: Float[Tensor, "B 2 D"], target: Float[Tensor, "B 2"], start: Float[Tensor, " D"]
+    column: Float[Tensor, "B 2 D"],
+    target: Float[Tensor, "B 2"],
+    start: Float[Tensor, " D"],
+    hold: Float[Tensor, " D"],
 ) -> Float[Tensor, " D"]:
     """The x of least sum of log(1 + |column x - target|^2 / SPREAD^2), held near its start."""
-    found, hold = start, LOOSE * len(target)
+    found, hold = start, hold * len(target)
     for _ in range(REWEIGHTED):
         off = target - column @ found
         weight = 1 / (1 + (off / SPREAD).square().sum(-1))
         rows = column * weight[:, None, None]
-        system = (rows.mT @ column).sum(0) + hold * torch.eye(len(start)).to(start)
+        system = (rows.mT @ column).sum(0) + hold.diag()
         right = (rows.mT @ target[..., None]).sum(0)[:, 0] + hold * start
         found = torch.linalg.solve(system, right)
     return found

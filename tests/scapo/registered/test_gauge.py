@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -19,6 +20,7 @@ from scapo.registered.gauge import (
     seat_hinges,
     settle_hinges,
     tells_frame,
+    touch,
 )
 from scapo.registered.template import ArticulatedTemplate, Placement
 from tests.helpers.sighted import AXIS, PIVOT, template
@@ -167,6 +169,49 @@ def test_a_hinge_that_is_right_stays():
     shape, placement = template(), hinged_elsewhere(200, 6)
     settle_hinges(shape, replace(placement, shift=torch.zeros_like(placement.shift)))
     assert_close(shape.pivot.detach()[0], PIVOT, atol=1e-4, rtol=0)
+
+
+def plates(opened: float, strays: int = 4) -> ArticulatedTemplate:
+    """A base of 1 x 0.8 and a lid at its edge x = -0.5, hinged along y, with a few stray points."""
+    g = generator(3)
+    flat = torch.rand(800, 3, generator=g) * torch.tensor([1.0, 0.8, 0.0])
+    flat -= torch.tensor([0.5, 0.4, 0.0])
+    part = (torch.arange(800) >= 400).long()
+    along = flat[:, 0] + 0.5
+    lid = torch.stack([math.cos(opened) * along - 0.5, flat[:, 1], math.sin(opened) * along], -1)
+    points = torch.where(part[:, None] == 1, lid, flat)
+    points[:strays] = torch.tensor([-0.42, 0.0, 0.1])
+    made = ArticulatedTemplate(("revolute",), len(points))
+    normals = torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
+    made.assign(points, normals, 8.0 * torch.nn.functional.one_hot(part, 2))
+    with torch.no_grad():
+        made.axis.copy_(torch.tensor([[0.0, 1.0, 0.0]]))
+        made.pivot.copy_(torch.tensor([[-0.42, 0.3, 0.1]]))
+    return made
+
+
+def test_a_hinge_is_pulled_to_where_its_parts_touch():
+    made, placement = plates(1.3), hinged_elsewhere(200, 7)
+    placement = replace(placement, shift=torch.zeros_like(placement.shift))
+    before, _ = made.place(placement)
+    edge = torch.tensor([-0.5, 0.3, 0.0])
+    assert (touch(made, 0) - edge).norm() < 0.03
+    held = plates(1.3)
+    settle_hinges(held, placement)
+    assert_close(held.pivot[0].detach(), torch.tensor([-0.42, 0.3, 0.1]), atol=1e-3, rtol=0)
+    found = settle_hinges(made, placement, touching=True)
+    assert (made.pivot[0].detach() - edge).norm() < 0.04
+    assert_close(made.place(found)[0], before, atol=2e-4, rtol=0)  # the shifts make up for it
+
+
+def test_a_hinge_that_nothing_touches_or_within_both_parts_stays():
+    made = plates(0.0, strays=0)  # the lid lies on the base
+    with torch.no_grad():
+        made.pivot.copy_(torch.tensor([[0.0, 0.0, 0.0]]))
+    assert (touch(made, 0) - made.pivot[0]).norm() < 0.03
+    with torch.no_grad():
+        made.logit.copy_(torch.tensor([8.0, 0.0]).expand_as(made.logit))  # no lid at all
+    assert_close(touch(made, 0), made.pivot[0].detach())
 
 
 def test_pivots_slide_to_their_part_and_axes_have_length_one() -> None:
