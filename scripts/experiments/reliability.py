@@ -30,8 +30,9 @@ def main() -> None:
         if not path.is_file():
             continue
         found = read_calibration(path, sha256_file(file))
-        joints[found.category] = found.reliability["joint"]
-        cells = [found.category, str(found.samples)]
+        name = file.stem.replace("-", "/", 1)
+        joints[name] = found.reliability["joint"]
+        cells = [name, str(found.samples)]
         for kind in ("joint", "part"):
             one = found.reliability[kind]
             cells += [f"{one.base_rate:.0%}", f"{one.error:.0%}", f"{one.brier:.3f}"]
