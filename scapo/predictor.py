@@ -22,6 +22,7 @@ from scapo.types import Observation, Prediction
 class Predictor:
     """A trained method, for clouds of one category.
 
+    >>> from scapo.categories import CATEGORIES
     >>> from scapo.registered.config import RegisteredConfig
     >>> from scapo.registered.method import TemplateRegistration
     >>> config = RegisteredConfig(points=64, width=8)
