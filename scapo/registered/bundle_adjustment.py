@@ -182,7 +182,7 @@ def densified(
     dense = candidate.template.with_points(config.final_points)
     for number in range(rounds):
         rebuild(dense, views, placement, generator=generator)
-        if config.held_frame:  # of plates it follows the axis, which moves on in these rounds
+        if config.held_frame and not tells_frame(dense):  # it follows the axis, which still moves
             placement = along_main_directions(dense, placement)
         if config.way_out and number == 0:
             placement = choose_axes(dense, placement, torch.eye(3))
