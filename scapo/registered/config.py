@@ -76,6 +76,8 @@ class DiscoveryConfig(TemplateConfig):
     """Take the way out of the body for a sliding joint's axis."""
     mirror: bool = True
     """Try whether the base lacks a side that is the mirror image of another."""
+    halves: bool = True
+    """Try whether the two parts of a hinge are halves that are alike."""
     leans: bool = True
     """Try whether the axes of hinges deviate from one object to the next."""
     template_points: int = 400
@@ -143,7 +145,7 @@ def quick_config() -> RegisteredConfig:
     discovery = DiscoveryConfig(
         seeds=32, searched=48, trusted=(0.6, 0.85), starts=2, draws=2, objects=8, object_views=12,
         further_objects=8, further_views=8, contenders=1, heats=(), judged=16, mirror=False,
-        leans=False, final_points=800, dense_rounds=1,
+        halves=False, leans=False, final_points=800, dense_rounds=1,
     )  # fmt: skip
     return RegisteredConfig(preset="quick", discovery=discovery, learned=120, epochs=20)
 

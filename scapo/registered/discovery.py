@@ -29,6 +29,7 @@ from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.course import JUDGES, Course, numbered, plan_of
+from scapo.registered.halves import are_halves, in_halves, may_have_halves
 from scapo.registered.initialisation import common_frame, fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.object_frames import all_views, taught_by_objects
@@ -104,14 +105,8 @@ def discover(
         searched = owned_views(known, config.searched)
     else:
         tried = _of_draws(others, kinds, config, course)
-    best, shares = _best(tried, judges, half, config, course), config.trusted
-    rounds = numbered("round", len(shares))
-    if config.mirror and shares:
-        best, shares = completed(best, judges, half, config, course), shares[1:]
-        rounds = rounds[1:]
-    for name, share in zip(rounds, shares, strict=True):
-        best = course.step(name, partial(advance, best, searched, share, config, generator))
-        logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
+    best = _best(tried, judges, half, config, course)
+    best = _through_rounds(best, judges, (half, searched), config, course)
     dense = partial(densified, best, config, generator, config.dense_rounds)
     best = course.step("dense template", dense)
     if config.leans and "revolute" in kinds:
@@ -218,6 +213,35 @@ def _best(
     return left[course.step("judging templates", partial(ranked, left, judges, config))[0]]
 
 
+def _through_rounds(
+    best: Candidate,
+    judges: PartialViews,
+    searched: tuple[Searched, Searched],
+    config: DiscoveryConfig,
+    course: Course,
+) -> Candidate:
+    """The winner after its rounds: whether it lacks a side or is two halves is asked before them.
+
+    Args:
+        best: The winner.
+        judges: Views that are held out.
+        searched: Half of the views that the others are searched among, and all of them.
+        config: Which rounds there are.
+        course: Told of each.
+    """
+    rounds = dict(zip(numbered("round", len(config.trusted)), config.trusted, strict=True))
+    if config.mirror and rounds:
+        best = completed(best, judges, searched[0], config, course)
+        rounds.pop(next(iter(rounds)))
+    if config.halves and may_have_halves(best.template):
+        best = _or_in_halves(best, judges, config, course)
+    for name, share in rounds.items():
+        one = partial(advance, best, searched[1], share, config, course.generator)
+        best = course.step(name, one)
+        logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
+    return best
+
+
 def ranked(tried: list[Candidate], judges: PartialViews, config: DiscoveryConfig) -> list[int]:
     """The candidates by how well they explain the held-out views, the best first."""
     if len(tried) == 1:
@@ -274,6 +298,20 @@ def completed(
     shown = " ".join(f"{x:.3f}" for x in losses)
     logger.info("template as it is and with mirror images judged: %s; kept: %d", shown, best)
     return tried[best]
+
+
+def _or_in_halves(
+    best: Candidate, judges: PartialViews, config: DiscoveryConfig, course: Course
+) -> Candidate:
+    """The candidate, or one of two like halves where held-out views say so of dense templates."""
+    halved = course.step("two halves", partial(in_halves, best, course.generator))
+    judged = partial(_dense_losses, [best, halved], judges, config, course.generator)
+    was, now = course.step("judging halves", judged)
+    taken = now < was and are_halves(halved.template)
+    logger.info(
+        "template as it is and in two halves judged: %.3f %.3f; in two: %s", was, now, taken
+    )
+    return halved if taken else best
 
 
 def _dense_losses(

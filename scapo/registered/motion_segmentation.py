@@ -166,7 +166,9 @@ def rebuild(
         observers=order[:OBSERVERS],
     )
     score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
-    score = favouring_base(smooth(views, score))
+    score = smooth(views, score)
+    if not template.alike:
+        score = favouring_base(score)
     part = score.argmax(-1)
     chosen = part[..., None, None].expand(*part.shape, 1, 3)
     points = evidence.points.gather(2, chosen)[:, :, 0].flatten(0, 1)

@@ -28,6 +28,8 @@ NORMAL_LENGTH = 0.06
 normals of a plate's two faces differ by 2."""
 PART_LENGTH = 0.1
 """That of a unit of part weights, so that small parts are sampled along their borders too."""
+BUFFERS = ("rest", "load", "noise", "alike")
+"""What older templates were saved without."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +92,8 @@ class ArticulatedTemplate(nn.Module):
     """(2 J,) what axes deviate by, along the two directions across each; 0: they do not."""
     noise: Tensor
     """(2 J, 2 J) covariance of observed part rotations that no deviation explains."""
+    alike: Tensor
+    """() 1 where the parts are two like halves, of which neither is favoured as the base."""
 
     def __init__(self, kinds: tuple[JointKind, ...], count: int = 400) -> None:
         """A template of `count` points at the origin, to be filled by `assign`."""
@@ -103,6 +107,7 @@ class ArticulatedTemplate(nn.Module):
         self.register_buffer("rest", torch.zeros(len(kinds)))
         self.register_buffer("load", torch.zeros(2 * len(kinds)))
         self.register_buffer("noise", torch.eye(2 * len(kinds)))
+        self.register_buffer("alike", torch.zeros(()))
 
     def _load_from_state_dict(
         self,
@@ -111,8 +116,8 @@ class ArticulatedTemplate(nn.Module):
         *rest: Any,  # noqa: ANN401 - as torch calls it
         **named: Any,  # noqa: ANN401
     ) -> None:
-        """Axes of a template that was saved without deviations are the category's."""
-        for name in ("rest", "load", "noise"):
+        """Of a template that was saved without them axes are the category's, parts unlike."""
+        for name in BUFFERS:
             state_dict.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state_dict, prefix, *rest, **named)
 
@@ -138,7 +143,7 @@ class ArticulatedTemplate(nn.Module):
         """
         made = ArticulatedTemplate(self.kinds, count).to(self.points)
         made.assign(self.points[:count], self.normals[:count], self.logit[:count])
-        for name in ("axis", "pivot", "rest", "load", "noise"):
+        for name in ("axis", "pivot", *BUFFERS):
             getattr(made, name).copy_(getattr(self, name))
         return made
 

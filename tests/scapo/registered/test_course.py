@@ -88,6 +88,10 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         torch.rand(1, generator=rest[-1])
         return OrientationScorer()
 
+    def halved(one: Candidate, g: torch.Generator) -> Candidate:
+        made.append("halved")
+        return advancing(copied(one), g)
+
     for name, step in {
         "common_frame": lambda *_: posed,
         "fitted_proposals": lambda *x: [candidate("first", x[-1]) for _ in range(3)],
@@ -95,6 +99,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         "object_candidate": lambda *x: candidate("objects", x[-1]),
         "unexplained": lambda one, *_: float(one.template.pivot.detach().sum()),
         "densified": lambda one, _, g, *more: advancing(copied(one), g),
+        "in_halves": halved,
         "with_axis_deviation": lambda one, *x: advancing(copied(one), *x),
         "advance": advancing,
         "search_views": searching,
@@ -133,10 +138,13 @@ def test_the_plan_names_the_steps_that_are_taken(
 
 
 def test_steps_that_are_not_needed_are_not_planned() -> None:
-    bare = list(plan_of(replace(FEW, leans=False), KINDS, 100))
-    assert bare == [name for name in plan_of(FEW, KINDS, 100) if name != "deviating axes"]
+    bare = list(plan_of(replace(FEW, leans=False, halves=False), KINDS, 100))
+    of_hinges = ("two halves", "judging halves", "deviating axes")
+    assert bare == [name for name in plan_of(FEW, KINDS, 100) if name not in of_hinges]
     assert list(plan_of(FEW, ("prismatic",), 100)) == bare
-    few = replace(FEW, draws=1, finalists=9, mirror=False, trusted=(), heats=(0.5,))
+    two = list(plan_of(replace(FEW, leans=False), KINDS * 2, 100))
+    assert not {"two halves", "judging halves"} & {*two}
+    few = replace(FEW, draws=1, finalists=9, mirror=False, halves=False, trusted=(), heats=(0.5,))
     assert list(plan_of(few, KINDS, 100)) == [
         "draw 1 of 1, registration", "draw 1 of 1, templates", "judging first templates",
         "rung 1 of 1, template 1 of 2", "rung 1 of 1, template 2 of 2", "judging templates",
