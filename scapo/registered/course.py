@@ -34,7 +34,7 @@ T = TypeVar("T")
 JUDGES = 4  # At most one view in so many is held out
 PAIR, GRID = 0.010, 1000
 """Seconds of one core, as all below: a pair of views that is registered over so many rotations."""
-FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, HALVES, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 50.0, 40.0
+FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, HALVES, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 30.0, 40.0
 """A view that a first template is fitted to; an object beside its pairs; the first template of
 several objects; bundle adjustment after a search; a dense template; two like halves; axes that
 deviate."""
@@ -77,9 +77,10 @@ def plan_of(
         plan |= {f"{rounds[0]}, {one}": half for one in numbered("mirror image", 4)}
         plan["judging mirror images"] = 4 * (DENSE + judged)
         rounds = rounds[1:]
-    if config.halves and kinds == ("revolute",):
-        plan |= {"two halves": HALVES, "judging halves": 2 * (DENSE + judged)}
-    plan |= dict.fromkeys(rounds, VIEW * min(config.searched, views) + FIT)
+    one_round = VIEW * min(config.searched, views) + FIT
+    plan |= dict.fromkeys(rounds, one_round)
+    if config.halves and config.trusted and kinds == ("revolute",):
+        plan |= {"two halves": HALVES + one_round, "judging halves": 2 * (DENSE + judged)}
     plan["dense template"] = DENSE * config.dense_rounds
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION

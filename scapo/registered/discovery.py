@@ -220,12 +220,12 @@ def _through_rounds(
     config: DiscoveryConfig,
     course: Course,
 ) -> Candidate:
-    """The winner after its rounds: whether it lacks a side or is two halves is asked before them.
+    """The winner after its rounds: whether it lacks a side is asked in the first, halves at last.
 
     Args:
         best: The winner.
         judges: Views that are held out.
-        searched: Half of the views that the others are searched among, and all of them.
+        searched: Half of the views that others are sought among, and all of them.
         config: Which rounds there are.
         course: Told of each.
     """
@@ -233,12 +233,12 @@ def _through_rounds(
     if config.mirror and rounds:
         best = completed(best, judges, searched[0], config, course)
         rounds.pop(next(iter(rounds)))
-    if config.halves and may_have_halves(best.template):
-        best = _or_in_halves(best, judges, config, course)
     for name, share in rounds.items():
         one = partial(advance, best, searched[1], share, config, course.generator)
         best = course.step(name, one)
         logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
+    if config.halves and config.trusted and may_have_halves(best.template):
+        best = _or_in_halves(best, judges, searched[1], config, course)
     return best
 
 
@@ -301,17 +301,26 @@ def completed(
 
 
 def _or_in_halves(
-    best: Candidate, judges: PartialViews, config: DiscoveryConfig, course: Course
+    best: Candidate,
+    judges: PartialViews,
+    searched: Searched,
+    config: DiscoveryConfig,
+    course: Course,
 ) -> Candidate:
-    """The candidate, or one of two like halves where held-out views say so of dense templates."""
-    halved = course.step("two halves", partial(in_halves, best, course.generator))
-    judged = partial(_dense_losses, [best, halved], judges, config, course.generator)
+    """The candidate, or one of two like halves after a round, where held-out views say so.
+
+    As mirror images they are judged by dense templates.
+    """
+    generator, share = course.generator, config.trusted[-1]
+
+    def halved() -> Candidate:
+        return advance(in_halves(best, generator), searched, share, config, generator)
+
+    tried = [best, course.step("two halves", halved)]
+    judged = partial(_dense_losses, tried, judges, config, generator)
     was, now = course.step("judging halves", judged)
-    taken = now < was and are_halves(halved.template)
-    logger.info(
-        "template as it is and in two halves judged: %.3f %.3f; in two: %s", was, now, taken
-    )
-    return halved if taken else best
+    logger.info("template as it is and in two halves judged: %.3f %.3f", was, now)
+    return tried[now < was and are_halves(tried[1].template)]
 
 
 def _dense_losses(

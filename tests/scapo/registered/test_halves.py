@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""Two like halves are found in frames between them, where a body and a part were taken for them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from scapo.categories import JointKind
+from scapo.geometry.rigid import random_rotations
+from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.registered.bundle_adjustment import Candidate, Inliers
+from scapo.registered.halves import are_halves, cuts, in_halves, may_have_halves, to_the_middle
+from scapo.registered.template import ArticulatedTemplate, Placement
+from scapo.registered.views import observe
+from tests.helpers.sighted import PIVOT, box, sighted, template
+from tests.helpers.strategies import generator
+
+UP = torch.tensor([0.0, 0.0, 1.0])
+HALF = torch.tensor([0.5, 0.05, 0.02])
+VIEWS = 10
+
+
+def bars(count: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Two bars that cross at the origin like scissors; points, normals and bars, at angle 0."""
+    g = generator(seed)
+    points, normals = box(HALF, count, g)
+    bar = (torch.rand(count, generator=g) < 0.5).long()
+    points[:, 2] += 0.04 * bar
+    return points, normals, bar
+
+
+def opened(points: Tensor, bar: Tensor, angle: Tensor) -> Tensor:
+    """Each bar turned by half of the angle, to its own side."""
+    turn = rotvec_to_rotmat(UP * torch.stack([-angle / 2, angle / 2])[:, None])
+    return (turn[bar] @ points[..., None])[..., 0]
+
+
+def scissors() -> tuple[Inliers, Tensor]:
+    """Views from either side in the frame between the bars, and how far these were open."""
+    g = generator(4)
+    rotation = random_rotations(VIEWS, g)
+    angle = 0.5 + 0.7 * torch.rand(VIEWS, generator=g)
+    side = (torch.arange(VIEWS) % 2) * 2.0 - 1
+    away = F.normalize(0.4 * torch.randn(VIEWS, 3, generator=g) + side[:, None] * UP, dim=-1)
+    clouds, cameras, centres = [], [], []
+    for b in range(VIEWS):
+        points, normals, bar = bars(4000, 10 + b)
+        points, normals = (opened(x, bar, angle[b]) for x in (points, normals))
+        seen = ((2 * away[b] - points) * normals).sum(-1) > 0
+        kept = points[seen][:500] @ rotation[b].T
+        centre = kept.mean(0)
+        clouds.append(kept - centre)
+        cameras.append(2 * rotation[b] @ away[b] - centre)
+        centres.append(-centre)
+    placement = Placement.at(rotation, torch.stack(centres), torch.zeros(VIEWS, 1))
+    return Inliers(views=observe(torch.stack(clouds), torch.stack(cameras)), placement=placement), (
+        angle
+    )
+
+
+def mistaken() -> ArticulatedTemplate:
+    """The tip of one bar for the part, everything else for the base, and the hinge there."""
+    points, normals, bar = bars(300, 1)
+    tip = (bar == 1) & (points[:, 0] > 0.3)
+    made = ArticulatedTemplate(("revolute",), 300)
+    angle = torch.tensor(0.85)
+    logit = 6.0 * F.one_hot(tip.long(), 2)
+    made.assign(opened(points, bar, angle), opened(normals, bar, angle), logit)
+    with torch.no_grad():
+        made.axis.copy_(UP[None])
+        made.pivot.copy_(torch.tensor([[0.3, 0.15, 0.0]]))
+    return made
+
+
+def test_the_halves_of_scissors_are_found_where_the_tip_of_one_was_the_part():
+    inliers, angle = scissors()
+    found = in_halves(Candidate(template=mistaken(), inliers=inliers), generator(2))
+    made, placement = found.template, found.inliers.placement
+    assert are_halves(made)
+    assert not are_halves(mistaken())
+    points, _, bar = bars(3000, 2)
+    state = placement.state[:, 0].detach()
+    agreement = torch.corrcoef(torch.stack([state, angle]))[0, 1]
+    assert agreement.abs() > 0.9
+    placed, shares = made.place(placement)[0].detach(), list[Tensor]()
+    for b in range(VIEWS):
+        true = opened(points, bar, angle[b]) @ inliers.placement.rotation[b].T
+        off = torch.cdist(placed[b], true + inliers.placement.translation[b])
+        right = bar[off.argmin(-1)] == made.logit.argmax(-1)
+        shares.append(right.float().mean())
+    share = torch.stack(shares)
+    assert torch.maximum(share, 1 - share).min() > 0.8
+    assert made.pivot.detach()[0, :2].norm() < 0.08
+
+
+@torch.no_grad()
+def test_the_middle_is_as_far_from_the_base_as_from_the_part():
+    _, placement = sighted(3, seed=3)
+    shift = 0.02 * torch.randn(3, 1, 3, generator=generator(1)) * torch.tensor([1.0, 0.0, 1.0])
+    placement = replace(placement, shift=shift)
+    shape = template()
+    poses = shape.part_poses(placement)
+    middle = to_the_middle(shape, placement)
+    assert not middle.state.any()
+    assert not middle.shift.any()
+    turns = [middle.rotation.mT @ poses.rotation[:, p] for p in (0, 1)]
+    assert torch.allclose(turns[0], turns[1].mT, atol=1e-5)
+    ends = [(poses.rotation[:, p] @ PIVOT) + poses.translation[:, p] for p in (0, 1)]
+    between = (middle.rotation @ PIVOT) + middle.translation
+    assert torch.allclose(between, (ends[0] + ends[1]) / 2, atol=1e-5)
+
+
+def test_cuts_halve_the_shape_about_the_axis():
+    shape = mistaken()
+    made = cuts(shape)
+    labels = torch.stack([cut.logit.argmax(-1) for cut in made])
+    assert len(made) == 7
+    assert all(bool(cut.alike) for cut in made)
+    assert not shape.alike
+    points, _, bar = bars(300, 1)
+    along = points[:, 0] > 0
+    for number, truth in ((0, along == (bar == 1)), (3, along), (4, bar == 1)):
+        right = (labels[number] == truth).float().mean()
+        assert max(right, 1 - right) > 0.9
+    for number in (3, 4):
+        assert made[number].pivot.detach()[0, :2].norm() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("kinds", "may"),
+    [(("revolute",), True), (("prismatic",), False), (("revolute", "revolute"), False)],
+)
+def test_two_parts_with_a_hinge_may_be_halves(kinds: tuple[JointKind, ...], may: bool):
+    assert may_have_halves(ArticulatedTemplate(kinds, 4)) == may
