@@ -307,14 +307,18 @@ def _or_in_halves(
     config: DiscoveryConfig,
     course: Course,
 ) -> Candidate:
-    """The candidate, or one of two like halves after a round, where held-out views say so.
+    """The candidate, or the best of two like halves after a round, where held-out views say so.
 
     As mirror images they are judged by dense templates.
     """
     generator, share = course.generator, config.trusted[-1]
 
     def halved() -> Candidate:
-        return advance(in_halves(best, generator), searched, share, config, generator)
+        tried = in_halves(best, generator)
+        losses = _dense_losses(tried, judges, config, generator)
+        logger.info("cuts in two judged: %s", " ".join(f"{loss:.3f}" for loss in losses))
+        chosen = tried[min(range(len(tried)), key=losses.__getitem__)]
+        return advance(chosen, searched, share, config, generator)
 
     tried = [best, course.step("two halves", halved)]
     judged = partial(_dense_losses, tried, judges, config, generator)

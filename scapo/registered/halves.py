@@ -8,7 +8,7 @@ left to be seen, and what is seen says nothing of what is one half (a blade and 
 
 So all views are turned to the middle of what was found, and there every simple way to cut a shape
 in two about the axis is a start: lengthwise, across, or crosswise, where opposite quarters are one
-half. The one that fits best is built anew and fitted in rounds, with no half favoured as the base.
+half. Those that fit best are built anew and fitted in rounds, with no half favoured as the base.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
 
-COMPARED = 40  # Inliers, at most, by which cuts are compared
+FITTED = 60  # Inliers, at most, that halves are fitted to
+CONTENDERS = 3  # Cuts, those that fit best at first, that are gone on with
 PLACES = (0.35, 0.5, 0.65)  # Of the pivot along the shape, over its length
 STATES = 25  # Tried of the hinge: 0.14 rad apart, half of which is left in the middle
-ROUNDS = 4  # Of fitting the best cut to all inliers and building it anew
+ROUNDS = 4  # Of fitting a cut and building it anew
 LEAST_HALF = 0.4
 """Share of the smaller of two halves. Without a favoured base any template explains views a little
 better: what differs from object to object goes to either part. Of ovens' doors 0.31 come of it,
@@ -63,23 +64,27 @@ def are_halves(template: ArticulatedTemplate) -> bool:
     return LEAST_HALF <= share <= 1 - LEAST_HALF
 
 
-def in_halves(candidate: Candidate, generator: torch.Generator) -> Candidate:
-    """The best template of two like halves on the candidate's inliers.
+def in_halves(candidate: Candidate, generator: torch.Generator) -> list[Candidate]:
+    """Templates of two like halves on some of the candidate's inliers, those that fit best.
 
     Args:
         candidate: With one hinge (`may_have_halves`); it stays as it is.
         generator: Draws points.
     """
-    template, views = candidate.template, candidate.inliers.views
-    start = to_the_middle(template, candidate.inliers.placement)
-    some = evenly(len(views.points), COMPARED)
-    few, placed = take(views, some), take(start, some)
-    losses = [_round(_Fit(cut, placed), few, generator, number=0).loss for cut in cuts(template)]
-    logger.info("cuts in two fitted: %s", " ".join(f"{loss:.4f}" for loss in losses))
-    fit = _Fit(cuts(template)[min(range(len(losses)), key=losses.__getitem__)], start)
-    for number in range(ROUNDS):
-        fit = _round(fit, views, generator, number=number)
-    return Candidate(template=fit.template, inliers=Inliers(views=views, placement=fit.placement))
+    some = evenly(len(candidate.inliers.views.points), FITTED)
+    inliers = take(candidate.inliers, some)
+    views, start = inliers.views, to_the_middle(candidate.template, inliers.placement)
+    fits = [
+        _round(_Fit(cut, start), views, generator, number=0) for cut in cuts(candidate.template)
+    ]
+    logger.info("cuts in two fitted: %s", " ".join(f"{fit.loss:.4f}" for fit in fits))
+    best = sorted(fits, key=lambda fit: fit.loss)[:CONTENDERS]
+    for number in range(1, ROUNDS):
+        best = [_round(fit, views, generator, number=number) for fit in best]
+    return [
+        Candidate(template=fit.template, inliers=Inliers(views=views, placement=fit.placement))
+        for fit in best
+    ]
 
 
 @torch.no_grad()

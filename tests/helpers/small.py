@@ -24,7 +24,8 @@ FLAGS: dict[str, list[str]] = {
         "--discovery.seeds", "8", "--discovery.searched", "8", "--discovery.rotations", "200",
         "--discovery.starts", "1", "--discovery.draws", "1", "--discovery.judged", "2",
         "--discovery.finalists", "1", "--discovery.trusted", "0.9", "--discovery.heats", "0.8",
-        "--discovery.no-mirror", "--discovery.no-leans",
+        "--discovery.no-mirror", "--discovery.no-leans", "--discovery.no-halves",
+        "--discovery.dense-rounds", "1",
         "--discovery.template-points", "60", "--discovery.final-points", "80",
     ],
     "registered-labelled": [

@@ -88,9 +88,9 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         torch.rand(1, generator=rest[-1])
         return OrientationScorer()
 
-    def halved(one: Candidate, g: torch.Generator) -> Candidate:
+    def halved(one: Candidate, g: torch.Generator) -> list[Candidate]:
         made.append("halved")
-        return advancing(copied(one), g)
+        return [advancing(copied(one), g) for _ in range(2)]
 
     for name, step in {
         "common_frame": lambda *_: posed,

@@ -105,7 +105,9 @@ def test_mirror_images_take_the_first_round_on_half_of_the_views(
         "search_views": lambda *_: everywhere,
     }.items():
         monkeypatch.setattr(discovery, name, step)
-    tried = DiscoveryConfig(draws=1, searched=12, trusted=(0.5, 0.7), heats=(0.3,), leans=False)
+    tried = DiscoveryConfig(
+        draws=1, searched=12, trusted=(0.5, 0.7), heats=(0.3,), halves=False, leans=False
+    )
     expected = {
         True: [("advance", 6, 0.3), ("completed", 6, 4), ("advance", 12, 0.7)],
         False: [("advance", 6, 0.3), ("advance", 12, 0.5), ("advance", 12, 0.7)],

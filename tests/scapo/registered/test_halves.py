@@ -79,7 +79,8 @@ def mistaken() -> ArticulatedTemplate:
 
 def test_the_halves_of_scissors_are_found_where_the_tip_of_one_was_the_part():
     inliers, angle = scissors()
-    found = in_halves(Candidate(template=mistaken(), inliers=inliers), generator(2))
+    found, *others = in_halves(Candidate(template=mistaken(), inliers=inliers), generator(2))
+    assert len(others) == 2
     made, placement = found.template, found.inliers.placement
     assert are_halves(made)
     assert not are_halves(mistaken())

@@ -196,7 +196,8 @@ def test_the_bound_explains_the_views_at_least_as_well_as_what_is_discovered() -
     seen = objects(6, 4, seed=6)
     discovery = DiscoveryConfig(
         seeds=10, rotations=200, searched=12, trusted=(0.9,), starts=1, draws=1, heats=(),
-        judged=4, template_points=120, final_points=300, mirror=False, leans=False,
+        judged=4, template_points=120, final_points=300, mirror=False, halves=False,
+        leans=False,
     )  # fmt: skip
     config = RegisteredConfig(discovery=discovery, points=128, width=8, epochs=1)
     found = TemplateRegistration(config, CATEGORIES["oven"], generator(0))

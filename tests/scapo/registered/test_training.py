@@ -31,7 +31,7 @@ from tests.scapo.training.test_fit import InterruptedRunError, same
 
 DISCOVERY = DiscoveryConfig(
     seeds=12, rotations=200, searched=12, trusted=(0.9,), starts=3, draws=1, heats=(), judged=4,
-    mirror=False, template_points=120, final_points=240,
+    mirror=False, halves=False, template_points=120, final_points=240,
 )  # fmt: skip
 """Mirror images, half of the time: `test_discovery`."""
 
