@@ -34,7 +34,7 @@ T = TypeVar("T")
 JUDGES = 4  # At most one view in so many is held out
 PAIR, GRID = 0.010, 1000
 """Seconds of one core, as all below: a pair of views that is registered over so many rotations."""
-FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, HALVES, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 60.0, 40.0
+FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, HALVES, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 80.0, 40.0
 """A view that a first template is fitted to; an object beside its pairs; the first template of
 several objects; bundle adjustment after a search; a dense template; two like halves; axes that
 deviate."""

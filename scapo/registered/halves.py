@@ -6,9 +6,11 @@ or of a suitcase are equally large, and the frame in which most views agree is t
 it each half has turned by half of the state, one this way and one that. Little of that motion is
 left to be seen, and what is seen says nothing of what is one half (a blade and the handle across).
 
-So all views are turned to the middle of what was found, and there every simple way to cut a shape
-in two about the axis is a start: lengthwise, across, or crosswise, where opposite quarters are one
-half. Those that fit best are built anew and fitted in rounds, with no half favoured as the base.
+So every simple way to cut a shape in two about the axis is a start: lengthwise, across, or
+crosswise, where opposite quarters are one half; with the views where they are (which is that middle
+where two halves were taken for a body) and turned to the middle of what was found (where a half was
+found well). Those that fit best are built anew and fitted in rounds, with no half favoured as the
+base.
 """
 
 from __future__ import annotations
@@ -42,10 +44,11 @@ from scapo.registered.views import PartialViews
 logger = logging.getLogger(__name__)
 
 FITTED = 60  # Inliers, at most, that halves are fitted to
-CONTENDERS = 3  # Cuts, those that fit best at first, that are gone on with
+KEPT = (8, 4, 4, 3)
+"""Cuts, those that fit best, that are kept after each round of fitting and building anew: which is
+right shows late."""
 PLACES = (0.35, 0.5, 0.65)  # Of the pivot along the shape, over its length
 STATES = 25  # Tried of the hinge: 0.14 rad apart, half of which is left in the middle
-ROUNDS = 4  # Of fitting a cut and building it anew
 LEAST_HALF = 0.4
 """Share of the smaller of two halves. Without a favoured base any template explains views a little
 better: what differs from object to object goes to either part. Of ovens' doors 0.31 come of it,
@@ -71,20 +74,29 @@ def in_halves(candidate: Candidate, generator: torch.Generator) -> list[Candidat
         candidate: With one hinge (`may_have_halves`); it stays as it is.
         generator: Draws points.
     """
+    template = candidate.template
     some = evenly(len(candidate.inliers.views.points), FITTED)
     inliers = take(candidate.inliers, some)
-    views, start = inliers.views, to_the_middle(candidate.template, inliers.placement)
-    fits = [
-        _round(_Fit(cut, start), views, generator, number=0) for cut in cuts(candidate.template)
-    ]
-    logger.info("cuts in two fitted: %s", " ".join(f"{fit.loss:.4f}" for fit in fits))
-    best = sorted(fits, key=lambda fit: fit.loss)[:CONTENDERS]
-    for number in range(1, ROUNDS):
-        best = [_round(fit, views, generator, number=number) for fit in best]
+    views, placement = inliers.views, inliers.placement
+    starts = (at_rest(placement), to_the_middle(template, placement))
+    fits = [_Fit(cut, start) for start in starts for cut in cuts(template)]
+    for number, kept in enumerate(KEPT):
+        fits = [_round(fit, views, generator, number=number) for fit in fits]
+        fits = sorted(fits, key=lambda fit: fit.loss)[:kept]
+        logger.info("cuts in two fitted: %s", " ".join(f"{fit.loss:.4f}" for fit in fits))
     return [
         Candidate(template=fit.template, inliers=Inliers(views=views, placement=fit.placement))
-        for fit in best
+        for fit in fits
     ]
+
+
+def at_rest(placement: Placement) -> Placement:
+    """Where the bases are, with states and shifts of zero."""
+    return replace(
+        placement,
+        state=torch.zeros_like(placement.state),
+        shift=torch.zeros_like(placement.shift),
+    )
 
 
 @torch.no_grad()
@@ -94,11 +106,9 @@ def to_the_middle(template: ArticulatedTemplate, placement: Placement) -> Placem
     pivot = template.pivot[0] * placement.log_scale.exp()
     move = pivot - (turn @ pivot[..., None])[..., 0] + placement.shift[:, 0] / 2
     return replace(
-        placement,
+        at_rest(placement),
         rotation=placement.rotation @ turn,
         translation=placement.translation + (placement.rotation @ move[..., None])[..., 0],
-        state=torch.zeros_like(placement.state),
-        shift=torch.zeros_like(placement.shift),
     )
 
 
@@ -144,7 +154,7 @@ def _round(fit: _Fit, views: PartialViews, generator: torch.Generator, *, number
     options = FitOptions(
         steps=FIRST_STEPS,
         sharpness=SHARP if number else BLUNT,
-        search_states=FIRST_SEARCHED if number < ROUNDS // 2 else (),
+        search_states=FIRST_SEARCHED if number < len(KEPT) // 2 else (),
     )
     placement, loss = bundle_adjust(
         template, views, fit.placement, options, states=states, generator=generator
