@@ -13,6 +13,7 @@ from torch import Tensor
 from scapo.categories import JointKind
 from scapo.geometry.rigid import random_rotations
 from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.registered import halves
 from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.halves import are_halves, cuts, in_halves, may_have_halves, to_the_middle
 from scapo.registered.template import ArticulatedTemplate, Placement
@@ -77,7 +78,11 @@ def mistaken() -> ArticulatedTemplate:
     return made
 
 
-def test_the_halves_of_scissors_are_found_where_the_tip_of_one_was_the_part():
+def test_the_halves_of_scissors_are_found_where_the_tip_of_one_was_the_part(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    monkeypatch.setattr(halves, "PLACES", (0.5,))  # fewer cuts, for time
+    monkeypatch.setattr(halves, "KEPT", (3, 3, 3))
     inliers, angle = scissors()
     found, *others = in_halves(Candidate(template=mistaken(), inliers=inliers), generator(2))
     assert len(others) == 2
