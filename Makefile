@@ -62,7 +62,7 @@ bench: setup ## speed tests
 
 docs: setup ## the pages of docs/ as a site in build/site
 	@$(BIN)/python -m pip install -q --no-build-isolation -e '.[docs]'
-	@$(BIN)/mkdocs build --strict $(ARGS)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict $(ARGS)
 
 lock: setup ## resolve pyproject.toml anew into the lock files (ARGS=--upgrade)
 	@scripts/lock.sh $(ARGS)

@@ -41,7 +41,7 @@ from sim_assets.models.parse import parse
 from sim_assets.models.resolver import SourceFiles
 from sim_assets.models.robot import Robot
 from sim_assets.models.sides import used_vertices
-from sim_assets.models.sources import Traits, traits
+from sim_assets.models.sources import GENERIC, Traits, traits
 from sim_assets.models.validate import Repairs, check_object, check_poses, check_robot, refuse
 from sim_assets.objects import Account, ArticulatedObject, Origin, Visual
 
@@ -122,11 +122,11 @@ def _read(
     files: SourceFiles, spec: Category, up: str | None, front: str | None, scale: float | None
 ) -> ArticulatedObject:
     urdf, model = files.urdf, load(files)
-    upward = frames.direction(up or model.known.up, urdf)
     reduction = reduce(model.robot, model.surfaces, spec, model.known)
+    upward = _upward(model, reduction, spec, up, files.repairs)
     rests = find_rest(model.robot, model.surfaces, reduction, spec, upward)
     resting = _resting(model, reduction, rests)
-    rotation = _rotation(resting, spec, (up, front), files.repairs)
+    rotation = _rotation(resting, spec, upward, (up, front), files.repairs)
     resting = _ordered(resting, spec, rotation)
     bounds = resting.bounds(rotation)
     low, high = bounds[:, 0].min(0), bounds[:, 1].max(0)
@@ -170,6 +170,22 @@ def package_root(urdf: Path) -> Path:
     return folder.parent.parent if folder.name in INNER else folder
 
 
+def _upward(
+    model: Model, reduction: Reduction, category: Category, up: str | None, repairs: Repairs
+) -> Vector:
+    """Unit, root link: by the caller, then the source, then the joint where none is known."""
+    path, known = model.robot.path, model.known
+    usual = frames.direction(up or known.up, path)
+    if up is not None or known.set_name != GENERIC:
+        return usual
+    poses = model.robot.poses({})
+    axis = np.stack([poses[joint.child][:3, :3] @ joint.axis for joint in reduction.joints])
+    told = frames.told_up(category, usual, axis)
+    if not np.array_equal(told, usual):
+        repairs.add(f"What is up was told from the joint: {frames.name_of(told)}")
+    return told
+
+
 def _resting(model: Model, reduction: Reduction, rests: tuple[Rest, ...]) -> _Resting:
     robot, surfaces = model.robot, model.surfaces
     names = [joint.name for joint in reduction.joints]
@@ -202,12 +218,12 @@ def _resting(model: Model, reduction: Reduction, rests: tuple[Rest, ...]) -> _Re
 def _rotation(
     resting: _Resting,
     category: Category,
+    upward: Vector,
     wanted: tuple[str | None, str | None],
     repairs: Repairs,
 ) -> Float[np.ndarray, "3 3"]:
     """object_R_asset: by the caller, then a joint that is sure, then the source, then the joint."""
     path, known = resting.model.robot.path, resting.model.known
-    upward = frames.direction(wanted[0] or known.up, path)
     if category.name == "scissors":
         return _along_blades(resting, upward, wanted[1])
     if wanted[1] is not None:

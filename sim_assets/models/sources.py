@@ -18,6 +18,9 @@ MAX_BYTES = 4 << 20
 IMPORTED = ("hoi4d", "shape2motion")
 """Sets whose models `scapo-data import` writes as URDFs, whose robots it names after the set."""
 
+GENERIC = "urdf"
+"""Any other model."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Traits:
@@ -48,7 +51,7 @@ def traits(robot: Robot) -> Traits:
     for name in IMPORTED:
         if robot.name.startswith(f"{name}_"):
             return Traits(set_name=name, metric=False, labels=own_names)
-    return _partnet(robot) or Traits(set_name="urdf", labels=own_names)
+    return _partnet(robot) or Traits(set_name=GENERIC, labels=own_names)
 
 
 def _partnet(robot: Robot) -> Traits | None:

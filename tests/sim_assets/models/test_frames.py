@@ -106,6 +106,32 @@ def test_drawer(axis: str, limit: str, sign: float, tmp_path: Path):
     np.testing.assert_allclose(thing.pivot[0], thing.part_mesh(1).bounds.mean(0), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "axis", "up", "told"),
+    [
+        ("safe", "0 1 0", None, "y"),  # a fridge as glTF has it
+        ("safe", "0 0.02 1", None, "z"),
+        ("safe", "1 0 0", None, "z"),  # neither way
+        ("safe", "0 1 0", "-y", "-y"),
+        ("oven", "0 0 1", None, "y"),
+        ("oven", "0 1 0", None, "z"),
+        ("washer", "0 1 0", None, "z"),  # fronts and lids: nothing is told
+    ],
+)
+def test_what_is_up_is_told_where_the_joint_would_lie_wrong(
+    name: str, axis: str, up: str | None, told: str, tmp_path: Path
+):
+    """A safe's hinge stands and an oven's lies; what the caller says goes before."""
+    links = {"body": box((0.4, 0.6, 0.5), (0, 0, 0)), "door": box((0.3, 0.3, 0.3), (0.2, 0.1, 0.1))}
+    joints = joint("hinge", ("body", "door"), 'xyz="0.2 0 0"', axis, "0 1.5")
+    origin = reader.read(write(tmp_path, links, joints), name, up=up).origin
+    ratio = np.cbrt(np.linalg.det(origin.object_T_asset[:3, :3]))
+    upward = origin.object_T_asset[2, :3] / ratio
+    np.testing.assert_allclose(upward, frames.direction(told, tmp_path), atol=1e-9)
+    said = f"What is up was told from the joint: {told}" in origin.repairs
+    assert said == (up is None and told != "z")
+
+
 def test_drawer_of_no_metric_size(tmp_path: Path):
     """The travel is scaled with the model, and no longer than the category's."""
     links = {"body": box((40, 40, 50), (0, 0, 0)), "tray": box((30, 38, 10), (-2, 0, 0))}

@@ -218,10 +218,12 @@ def test_partnet_models_keep_their_frame(models: Models):
 
 
 def test_overrides(shared_dir: Path):
-    """A fridge modelled with y up stands when told so."""
+    """A fridge modelled with y up stands, for its doors' hinges do, and lies when told so."""
     urdf = shared_dir / "assets/fridge/habitat_fridge/fridge.urdf"
-    lying = reader.read(urdf, "safe")
-    standing = reader.read(urdf, "safe", up="y")
+    lying = reader.read(urdf, "safe", up="z")
+    standing = reader.read(urdf, "safe")
+    assert "top_door_hinge" in standing.origin.joint_names
+    assert standing.pivot[0, 2] > 0.3
     assert lying.extents()[2] < 0.8
     assert standing.extents()[2] > 1.9
     assert abs(standing.axis[0, 2]) > 0.99
