@@ -14,8 +14,8 @@ goes before, unless a door or drawer plainly (within 26 degrees) opens another w
   +x, the rings towards the user; the first blade is the one from which the other opens by a turn
   about -z, so that when they open the first tip is at +y.
 
-What is up is the caller's, else the source's. A URDF of no known set has z up by REP 103, unless
-its joint then lies as no joint of the category does, and with y up, as in glTF, as they all do.
+What is up is the caller's, else the source's. A URDF of no known set has z up by REP 103, but a
+safe whose hinge runs along y has y up, as in glTF: safes' hinges stand.
 
 Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
 Left of eyeglasses is the wearer's, who looks out of the front: -y. Left of a basket is that of
@@ -37,8 +37,6 @@ from sim_assets.models.validate import Repairs, refuse
 AXES = ("x", "y", "z")
 SURE = 0.9
 """Cosine of the angle to an axis of the root link up to which a door's motion tells the front."""
-UPRIGHT = {"safe": True, "laptop": False, "suitcase": False, "oven": False, "drawer": False}
-"""Whether the joint's axis stands; the other categories have both, or say it in their rest."""
 ABSURD = 4.0
 """A metric model larger or smaller than its category's nominal diagonal by this is rescaled."""
 
@@ -102,18 +100,12 @@ def told_up(category: Category, up: Vector, axis: Float[np.ndarray, "J 3"]) -> V
     """What is up in a model whose source has it by convention alone, by the rule above.
 
     Args:
-        category: Says whether its joint's axis stands or lies.
+        category: Safes alone tell it.
         up: By the convention; unit, root link.
         axis: Unit, root link.
     """
-    stands = UPRIGHT.get(category.name)
-
-    def fits(wanted: Vector) -> bool:
-        along = np.abs(axis @ wanted)
-        return bool((along > SURE if stands else along < np.sqrt(1 - SURE**2)).all())
-
     other = np.eye(3)[1]
-    return other if stands is not None and not fits(up) and fits(other) else up
+    return other if category.name == "safe" and abs(axis[0] @ other) > SURE else up
 
 
 def snapped(vector: Vector, up: Vector) -> Vector:
