@@ -14,7 +14,7 @@ says nothing of the joint.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -48,6 +48,7 @@ POINTED = ("camera_T_part", "joint_pivot", "joint_axis")
 
 
 BOOTSTRAPS = 500
+NUMBERS = ("mean", "median", "p95")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,25 +324,36 @@ def summary(values: np.ndarray, instance: Int[np.ndarray, " S"]) -> dict[str, An
     if known.size == 0:
         return out
     out["max"] = float(known.max())
-    draws = np.array(list(_draws(values, instance)))
-    for column, (name, value) in enumerate(_numbers(known).items()):
-        low, high = bounds(draws[:, column])
-        out[name] = {"value": value, "low": low, "high": high}
+    draws = _numbers(_resampled(values, instance))
+    for name, value, drawn in zip(NUMBERS, _numbers(known[None])[0], draws.T, strict=True):
+        low, high = bounds(drawn)
+        out[name] = {"value": float(value), "low": low, "high": high}
     return out
 
 
-def _numbers(known: Float[np.ndarray, " K"]) -> dict[str, float]:
-    median, high = np.quantile(known, [0.5, 0.95])
-    return {"mean": float(known.mean()), "median": float(median), "p95": float(high)}
+def _numbers(values: Float[np.ndarray, "D K"]) -> Float[np.ndarray, "E 3"]:
+    """`NUMBERS` of each row that holds a value, NaN left out."""
+    values = np.sort(values, axis=1)  # NaN last
+    counts = np.count_nonzero(~np.isnan(values), axis=1)
+    values, counts = values[counts > 0], counts[counts > 0]
+    columns = [np.nansum(values, axis=1) / counts]
+    for quantile in (0.5, 0.95):
+        place = quantile * (counts - 1)
+        below = np.floor(place).astype(np.int64)
+        low, high = (
+            np.take_along_axis(values, at[:, None], axis=1)[:, 0]
+            for at in (below, np.minimum(below + 1, counts - 1))
+        )
+        columns.append(low + (high - low) * (place - below))
+    return np.stack(columns, axis=1)
 
 
-def _draws(values: np.ndarray, instance: Int[np.ndarray, " S"]) -> Iterator[list[float]]:
-    """The numbers of each bootstrap draw that holds a value."""
+def _resampled(values: np.ndarray, instance: Int[np.ndarray, " S"]) -> Float[np.ndarray, "D K"]:
+    """The values of each bootstrap draw of whole objects, filled up with NaN."""
+    objects = [values[instance == number].ravel() for number in np.unique(instance)]
+    table = np.full((len(objects), max(map(len, objects))), np.nan)
+    for row, known in zip(table, objects, strict=True):
+        row[: len(known)] = known
     generator = np.random.default_rng(BOOTSTRAP_SEED)
-    objects = [values[instance == number] for number in np.unique(instance)]
-    for _ in range(BOOTSTRAPS):
-        chosen = generator.integers(len(objects), size=len(objects))
-        drawn = np.concatenate([objects[number] for number in chosen])
-        known = drawn[~np.isnan(drawn)]
-        if known.size:
-            yield list(_numbers(known).values())
+    chosen = generator.integers(len(objects), size=(BOOTSTRAPS, len(objects)))
+    return table[chosen].reshape(BOOTSTRAPS, -1)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import __main__ as program
 from bench.analysis.stability import (
+    BOOTSTRAPS,
     MOTIONS,
     SHIFT,
     Plan,
@@ -27,6 +28,7 @@ from bench.analysis.stability import (
     summary,
 )
 from bench.cli.console import quantity, stability_tables
+from bench.statistics import BOOTSTRAP_SEED
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from tests.helpers.splits import write_split
 from tests.helpers.tiny import TINY, tiny
@@ -231,6 +233,26 @@ def test_summary_names_the_tail_and_its_interval() -> None:
     assert found["p95"]["low"] <= found["p95"]["value"] <= found["p95"]["high"]
     assert found["median"]["high"] - found["median"]["low"] > 10
     assert summary(np.full((3, 1), np.nan), np.arange(3)) == {"count": 0, "undefined": 3}
+
+
+def test_intervals_are_those_of_one_draw_after_the_other() -> None:
+    """Objects of unlike size, several values a sample, some without an answer."""
+    generator = np.random.default_rng(2)
+    values = generator.normal(size=(33, 3))
+    values[generator.random(values.shape) < 0.3] = np.nan
+    instance = generator.integers(7, size=33)
+    values[instance == 3] = np.nan
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
+    kinds = np.unique(instance)
+    medians = []
+    for _ in range(BOOTSTRAPS):
+        chosen = kinds[generator.integers(len(kinds), size=len(kinds))]
+        drawn = np.concatenate([values[instance == kind].ravel() for kind in chosen])
+        medians.append(np.nanmedian(drawn))
+    low, high = np.quantile(medians, [0.025, 0.975])
+    found = summary(values, instance)["median"]
+    assert found["value"] == pytest.approx(np.nanmedian(values))
+    np.testing.assert_allclose([found["low"], found["high"]], [low, high], atol=1e-12)
 
 
 def test_the_command_writes_a_report_and_a_table(tmp_path, capsys) -> None:

@@ -289,7 +289,7 @@ def use(monkeypatch, renderer: RaycastSubScenes) -> RaycastSubScenes:
     [
         ("laptop", {}),
         ("eyeglasses", {"protocol": "isolated", "noise": "disparity"}),
-        ("drawer", {"states_per_view": 2}),
+        ("drawer", {"states_per_view": 2, "count": 12}),
     ],
     ids=["joint", "isolated", "states"],
 )
