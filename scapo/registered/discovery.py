@@ -69,7 +69,7 @@ class Discovery:
     template: ArticulatedTemplate
     found: SearchResult
     scorer: OrientationScorer | None = None
-    """What objects told of how they stand; None where none are known."""
+    """What objects told of how they stand; None where none are known, or views know as well."""
 
 
 def discover(
@@ -182,7 +182,7 @@ def _how_objects_stand(
     further: Sequence[PartialViews],
     config: DiscoveryConfig,
     course: Course,
-) -> OrientationScorer:
+) -> OrientationScorer | None:
     """What tells of any view how it stands, learned from objects against the final template."""
     posed = [one.posed for one in known]
     for name, views in zip(numbered("further object", len(further)), further, strict=True):

@@ -56,7 +56,7 @@ from scapo.registered.network import (
     vote_losses,
 )
 from scapo.registered.objects import ObjectViews, grouped
-from scapo.registered.orientation import OrientationScorer
+from scapo.registered.orientation import VIEWS_CHARGE, OrientationScorer
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
     BRIEF,
@@ -218,12 +218,13 @@ class AbstractRegistered(AbstractMethod):
         self.pseudo.show(ShownPoints.of(views))
 
     def _learn_orientation(self, views: PartialViews, made: Discovery, seed: Tensor) -> None:
-        """From objects, or else from the views that are placed most surely."""
+        """From objects that know better, or else from the views that are placed most surely."""
         scorer, sure = made.scorer, (self.pseudo.trust > 0).cpu()
         if scorer is None:
             generator = torch.Generator().manual_seed(int(seed))
             rotation = made.found.placement.rotation[sure]
-            scorer = OrientationScorer().learn(take(views, sure), rotation, generator)
+            scorer = OrientationScorer()
+            scorer.learn(take(views, sure), rotation, generator, price=VIEWS_CHARGE)
         self.orientation.load_state_dict(scorer.state_dict())
 
     def strip(self) -> None:

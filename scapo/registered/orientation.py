@@ -38,7 +38,8 @@ RATE, WARM, DECAY = 3e-3, 0.3, 0.05
 """Of AdamW at most, the share of the steps after which it is reached, and weight decay."""
 DROPPED, SMOOTHED = 0.3, 0.05  # Share of the first layer left out, and label smoothing
 CHARGE, MOST = 0.05, 6.0
-"""Loss that one nat costs a hypothesis, and the nats that one is charged for at most."""
+"""Loss that one nat costs a hypothesis where objects taught, and nats charged for at most."""
+VIEWS_CHARGE = 0.025  # Where single views did, as they were placed
 CHUNK = 4096  # Frames that are looked at at once
 
 
@@ -97,6 +98,9 @@ class OrientationScorer(nn.Module):
     learned: Tensor
     """1 once it was taught; before, it is not asked."""
 
+    price: Tensor
+    """Loss that one nat costs a hypothesis."""
+
     def __init__(self) -> None:
         """Not taught yet."""
         super().__init__()
@@ -105,6 +109,7 @@ class OrientationScorer(nn.Module):
         self.hidden = nn.Linear(WIDTH, WIDTH)
         self.last = nn.Linear(WIDTH, 1)
         self.register_buffer("learned", torch.zeros(()))
+        self.register_buffer("price", torch.tensor(CHARGE))
         initialise(self, torch.Generator().manual_seed(0))
 
     def forward(
@@ -145,7 +150,7 @@ class OrientationScorer(nn.Module):
         """What hypotheses cost for how unlikely they are beside the others of their view."""
         if not bool(self.learned):
             return torch.zeros_like(rotation[..., 0, 0])
-        return CHARGE * (-self(views, rotation).log_softmax(-1)).clamp_max(MOST)
+        return self.price * (-self(views, rotation).log_softmax(-1)).clamp_max(MOST)
 
     @torch.enable_grad()
     def learn(
@@ -154,6 +159,7 @@ class OrientationScorer(nn.Module):
         rotation: Float[Tensor, "B 3 3"],
         generator: torch.Generator,
         epochs: int = EPOCHS,
+        price: float = CHARGE,
     ) -> OrientationScorer:
         """Learn anew from views whose turns are known; returns itself.
 
@@ -162,6 +168,7 @@ class OrientationScorer(nn.Module):
             rotation: view_R_template of each.
             generator: On the host.
             epochs: Over all of them.
+            price: Loss that one nat costs from then on.
         """
         initialise(self, generator)
         count = len(rotation)
@@ -180,6 +187,7 @@ class OrientationScorer(nn.Module):
             optimiser.step()
             schedule.step()
         self.learned.fill_(1.0)
+        self.price.fill_(price)
         return self
 
     def _loss(

@@ -154,34 +154,92 @@ def an_object(views: PartialViews, rotation: Tensor, turn: Tensor) -> OneObject:
     return replace(posed, posed=inner)
 
 
-def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loss takes a wrong turn of two objects in five, the same; the consensus knows half."""
-    count, each = 24, 8
-    views, rotation = standing(count * each, 6)
-    turns = random_rotations(count, generator(7))
-    posed, first, turned = list[OneObject](), list[Tensor](), quarter_turns()[5]
-    for k in range(count):
-        rows = torch.arange(k * each, (k + 1) * each)
-        posed.append(an_object(take(views, rows), rotation[rows], turns[k]))
-        both = torch.stack([rotation[rows], rotation[rows] @ turned], 1)
-        first.append(both.flip(1) if k % 5 in (0, 2) else both)
-    frames = torch.cat(first)
+COUNT, EACH = 24, 8  # Objects, and views of each
+
+
+def objects_of_chairs(turns: Tensor) -> tuple[list[OneObject], Tensor]:
+    """Objects that are read right, and the true turns of all views."""
+    views, rotation = standing(COUNT * EACH, 6)
+    rows = torch.arange(COUNT * EACH).split(EACH)
+    some = [an_object(take(views, own), rotation[own], turns[k]) for k, own in enumerate(rows)]
+    return some, rotation
+
+
+def in_this_order(frames: Tensor) -> Hypotheses:
+    """Hypotheses (B, 2, 3, 3), the first of slightly less loss."""
     loss = torch.tensor([0.30, 0.31]).expand(len(frames), 2)
     flat = frames.flatten(0, 1)
     placement = Placement.at(flat, torch.zeros(len(flat), 3), torch.zeros(len(flat), 1))
-    hypotheses = Hypotheses(placement=placement, loss=loss, unlike=torch.zeros_like(loss))
+    return Hypotheses(placement=placement, loss=loss, unlike=torch.zeros_like(loss))
+
+
+def taught(
+    objects: list[OneObject], turns: Tensor, hypotheses: Hypotheses, patch: pytest.MonkeyPatch
+) -> OrientationScorer | None:
+    """By objects of which the first half are read with these turns, in two rounds of five."""
 
     def readings(some: list[OneObject], kinds: object) -> list[object]:
         del kinds
         return [type("Reading", (), {"turn": turns[k].mT})() for k in range(len(some))]
 
-    monkeypatch.setattr(object_frames, "agreeing", readings)
-    monkeypatch.setattr(object_frames, "TAUGHT", (0.4, 0.6, 0.9))  # two rounds of five
-    owned = all_views([one.posed for one in posed])
-    scorer = taught_by_objects(posed[:12], ("revolute",), owned, hypotheses, generator(8))
+    patch.setattr(object_frames, "agreeing", readings)
+    patch.setattr(object_frames, "TAUGHT", (0.4, 0.6, 0.9))
+    owned = all_views([one.posed for one in objects])
+    known = objects[: COUNT // 2]
+    return taught_by_objects(known, ("revolute",), owned, hypotheses, generator(8))
+
+
+def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loss takes a wrong turn of two objects in five, the same; the consensus knows half."""
+    turns = random_rotations(COUNT, generator(7))
+    objects, rotation = objects_of_chairs(turns)
+    both = torch.stack([rotation, rotation @ quarter_turns()[5]], 1)
+    number = torch.arange(COUNT).repeat_interleave(EACH)
+    wrong = torch.isin(number % 5, torch.tensor([0, 2]))[:, None, None, None]
+    frames = torch.where(wrong, both.flip(1), both)
+    scorer = taught(objects, turns, in_this_order(frames), monkeypatch)
+    assert scorer is not None
+    views, _ = standing(COUNT * EACH, 6)
     others, truth = standing(60, 9)
     mistaken = OrientationScorer().learn(views, frames[:, 0], generator(8))
     assert right(scorer, others, truth) > 0.8 > right(mistaken, others, truth) + 0.1
+
+
+def test_objects_that_know_no_better_than_the_loss_do_not_teach(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    turns = random_rotations(COUNT, generator(7))
+    objects, rotation = objects_of_chairs(turns)
+    both = torch.stack([rotation, rotation @ quarter_turns()[5]], 1)
+    assert taught(objects, turns, in_this_order(both), monkeypatch) is None
+
+
+def test_views_that_were_registered_wrongly_teach_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each object one view is turned against the others, which its own hypotheses deny."""
+    turns = random_rotations(COUNT, generator(7))
+    objects, rotation = objects_of_chairs(turns)
+    hypotheses = in_this_order(rotation[:, None].repeat(1, 2, 1, 1))
+    wrong = [
+        replace(one, posed=replace(one.posed, rotation=torch.cat(
+            [one.posed.rotation[:1] @ quarter_turns()[5], one.posed.rotation[1:]]
+        )))
+        for one in objects
+    ]  # fmt: skip
+    shown = list[Tensor]()
+
+    def learn(self: OrientationScorer, views: PartialViews, found: Tensor, *_: object) -> object:
+        del views
+        shown.append(found)
+        return self
+
+    monkeypatch.setattr(OrientationScorer, "learn", learn)
+    taught(wrong, turns, hypotheses, monkeypatch)
+    known = rotation.flatten(1)
+    for found in shown:
+        number = torch.cdist(found.flatten(1), known).argmin(1)
+        assert len(found) % (EACH - 1) == 0
+        assert bool((number % EACH > 0).all())
+        assert torch.equal(found, rotation[number])
 
 
 def test_the_consensus_takes_the_way_on_which_objects_agree() -> None:
