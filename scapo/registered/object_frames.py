@@ -47,8 +47,8 @@ SURE_NATS = 9.0  # Lead of a way that has no rival
 NEAR, LEAST_VOTE = 30.0, 0.1
 """Degrees from its object's way within which a hypothesis of a view says the same, and its vote
 over that of the view's best one with which it may be so: other views were registered wrongly."""
-LEAST_GAIN = 0.03
-"""Share of the views that must come to stand as their objects do: drawers 0.09, washers 0.01."""
+LEAST_GAIN = 0.07
+"""Share of the views that must come to stand as their objects do: drawers 0.09, washers 0.05."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
