@@ -179,7 +179,9 @@ def test_labels_change_nothing_where_they_are_not_declared() -> None:
     assert SEEN.labels.keep(bare.supervision) == Labels()
     config = RegisteredConfig(supervision=("instance",))
     told = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
-    assert SEEN.labels.keep(told.supervision) == Labels(instance=SEEN.labels.instance)
+    kept = SEEN.labels.keep(told.supervision)
+    assert kept.instance is SEEN.labels.instance
+    assert replace(kept, instance=None) == Labels()
     assert told.variant == "objects known"
     assert not bare.variant
 

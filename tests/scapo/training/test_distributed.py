@@ -35,7 +35,9 @@ def torchrun(*words: str) -> subprocess.CompletedProcess[str]:
     """Two processes."""
     helpers = REPOSITORY / "tests/helpers"
     path = os.pathsep.join([str(helpers), str(REPOSITORY)])
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    # By address: where a machine without a network cannot resolve its own name
+    here = ["--standalone", "--local-addr=127.0.0.1", "--nproc-per-node=2"]
+    command = [sys.executable, "-m", "torch.distributed.run", *here]
     environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     return subprocess.run(
         [*command, *words],
