@@ -10,7 +10,7 @@ densify the points. The mesh is a level set in tetrahedra, closed by constructio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -32,6 +32,8 @@ LEAST_SPACING = 0.005
 """Of the part's diagonal: repeated points are no finer sampling."""
 NOISY = 0.25
 """Spacings of the model's samples, from which noise on observed ones is worse than none of them."""
+DENSER = 0.4
+"""Spacings of the model's samples, to which observed points are thinned."""
 OUTLIER = 0.1
 """Of the model's diagonal: observed points farther off its samples are no part of the object."""
 REACH = 1.6
@@ -57,13 +59,15 @@ class Samples:
     """Unit."""
     noise: float = 0.0
     """m, how far points lie off the plane through their neighbours, as a rule."""
+    spacing: float = 0.0
+    """m, how far they are apart where they are sparse; where the points tell more, that holds."""
 
     def thinned(self, count: int) -> Samples:
         """At most so many, evenly from their order."""
         if len(self.points) <= count:
             return self
         index = np.linspace(0, len(self.points) - 1, count).astype(int)
-        return Samples(points=self.points[index], normals=self.normals[index])
+        return replace(self, points=self.points[index], normals=self.normals[index])
 
 
 def seen_samples(points: Float[np.ndarray, "N 3"], camera: Float[np.ndarray, " 3"]) -> Samples:
@@ -87,6 +91,8 @@ def joined(model: Samples, seen: Samples) -> Samples:
     """A model's samples, replaced by observed ones where there are some that face the same way.
 
     Of a sensor that is too noisy for the model's spacing none are taken, nor what is far from it.
+    Observed points are thinned to the model's spacing: by that of a dense depth image, what nobody
+    saw would have holes.
     """
     if not len(seen.points) or not len(model.points):
         return seen if len(seen.points) else model
@@ -95,13 +101,16 @@ def joined(model: Samples, seen: Samples) -> Samples:
     near = _nearest(KDTree(model.points), seen.points, 1)[0][:, 0] < OUTLIER * diagonal
     if seen.noise > NOISY * spacing or not near.any():
         return model
-    seen = Samples(points=seen.points[near], normals=seen.normals[near])
+    cells = np.floor(seen.points[near] / (DENSER * spacing)).astype(int)
+    kept = np.flatnonzero(near)[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+    seen = Samples(points=seen.points[kept], normals=seen.normals[kept])
     gap, index = _nearest(KDTree(seen.points), model.points, 1)
     alike = (seen.normals[index[:, 0]] * model.normals).sum(-1) > 0.5
     kept = ~((gap[:, 0] < spacing) & alike)
     return Samples(
         points=np.concatenate([model.points[kept], seen.points]),
         normals=np.concatenate([model.normals[kept], seen.normals]),
+        spacing=spacing,
     )
 
 
@@ -121,7 +130,7 @@ def closed_mesh(samples: Samples) -> trimesh.Trimesh:
     few = samples.thinned(MAX_SAMPLES)
     centre, turn = _principal(few.points)
     local = Samples(points=(few.points - centre) @ turn, normals=few.normals @ turn)
-    spacing = _spacing(local.points)
+    spacing = max(_spacing(local.points), samples.spacing)
     dense = _densified(_densified(_smoothed(local, spacing))).points
     wanted = spacing / FINE
     while True:

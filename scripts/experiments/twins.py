@@ -24,6 +24,7 @@ import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,15 +32,17 @@ import trimesh
 import yourdfpy
 from scipy.spatial import KDTree
 
+from bench.infer.answer import ask
+from bench.infer.cloud import Cloud
+from bench.infer.model import Model, load_model
+from bench.infer.readers import ReadOptions, read_input
 from bench.metrics import sample_errors
 from bench.scoring.truth import Truth, blocks
 from bench.twin.articulated import articulated
 from bench.twin.export import write_twin
 from bench.twin.record import BACKGROUND, Shape, Twin
-from bench.twin.surface import seen_samples
 from scapo.geometry.points import farthest_points
 from scapo.store import Split, open_split
-from scapo.store.predictions import Predictions
 from sim_assets.generation.assets import recover
 from sim_assets.objects import ArticulatedObject
 from sim_assets.sampling.cloud import sample_surface
@@ -50,6 +53,8 @@ them are asked for their nearest."""
 SHARES = (0.05, 0.35, 0.65, 0.95)
 """Of the travel: the other states."""
 HINGE, PIVOT = 5.0, 0.05
+FALL = 4.0
+"""Seconds of simulation that a twin has to come to rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,61 +124,38 @@ def true_twin(thing: ArticulatedObject, truth: Truth, i: int, bare: bool) -> Twi
     )
 
 
-def predicted_twin(thing: ArticulatedObject, truth: Truth, i: int, row: dict) -> Twin:
-    """What a predictions file says of a sample; limits are the category's about its state."""
-    part = row["part"] if "part" in row else row["part_weight"].argmax(-1)
-    poses, state = row["camera_T_part"].astype(float), row["joint_state"].astype(float)
-    upper = np.array([joint.upper for joint in thing.category.joints])
-    shape = None
-    if "canonical_points" in row:
-        placed = np.einsum("pij,mj->pmi", poses[:, :3, :3], row["canonical_points"].astype(float))
-        placed = placed + poses[:, None, :3, 3]
-        gaps = [
-            KDTree(truth.points[i][part == p]).query(placed[p])[0]
-            if (part == p).any()
-            else np.full(placed.shape[1], np.inf)
-            for p in range(len(poses))
-        ]
-        own = np.argmin(gaps, 0)
-        points = placed[own, np.arange(placed.shape[1])]
-        shape = Shape(points=points, normals=seen_samples(points, np.zeros(3)).normals, part=own)
-    return Twin(
-        name=thing.instance,
-        category=thing.category,
-        points=truth.points[i],
-        part=np.where(part < 0, BACKGROUND, part),
-        camera_T_part=poses,
-        pivot=row["joint_pivot"].astype(float),
-        axis=row["joint_axis"].astype(float),
-        state=state,
-        limits=np.stack([state - upper, state + upper], -1),
-        shape=shape,
-    )
+def found_twin(split: Split, truth: Truth, i: int, model: Model) -> Twin:
+    """What `infer` makes of a view: of its depth image where there is one, else of its cloud."""
+    index = truth.first + i
+    image = next(split.folder.glob(f"images/*/{index:04}.png"), None)
+    if image is None:
+        return ask(str(index), Cloud(points=truth.points[i]), model, "refine")
+    return ask(str(index), read_input(image, ReadOptions()), model, "refine")
 
 
 def samples(split: Split, given: argparse.Namespace) -> list[Sample]:
-    """One view of each of the first objects, with predictions of those that are answered."""
+    """The first view of each of the first objects."""
     made: dict[int, Sample] = {}
-    opened = None if given.predictions is None else Predictions(given.predictions, split)
+    category = split.manifest.category
+    name = category if given.model == "released" else given.model
+    model = None if name is None else load_model(name, "cpu", None)
     for truth in blocks(split):
-        rows = {} if opened is None else opened.rows(truth.first, len(truth))
         for i, instance in enumerate(truth.instance.tolist()):
-            row = {name: array[i] for name, array in rows.items()}
-            answered = not row or bool(np.isfinite(row["joint_axis"]).all())
-            if instance in made or not answered or len(made) == given.count:
+            if instance in made or len(made) == given.count:
                 continue
             thing = recover(split.manifest, instance, given.source)
-            if row:
-                twin = predicted_twin(thing, truth, i, row)
-            else:
+            if model is None:
                 twin = true_twin(thing, truth, i, given.bare)
+            else:
+                twin = found_twin(split, truth, i, model)
             made[instance] = sample(thing, truth, i, twin)
     return list(made.values())
 
 
 def sample(thing: ArticulatedObject, truth: Truth, i: int, twin: Twin) -> Sample:
     """With the errors of its joints, as the benchmark measures them."""
-    label = np.where(twin.part == BACKGROUND, 0, twin.part)
+    near = KDTree(twin.points).query(truth.points[i])[1]  # a depth image has other points
+    label = np.where(twin.part == BACKGROUND, 0, twin.part)[near]
     errors = sample_errors(
         part_true=truth.part[i][None],
         camera_T_part_true=truth.camera_T_part[i][None],
@@ -254,18 +236,23 @@ def twin_state(one: Sample, moved: np.ndarray) -> dict[str, float]:
     return wanted
 
 
-def drives(urdf: Path) -> bool:
-    """Whether SAPIEN loads it and its joints go from end to end and back as they are told."""
+def simulated(urdf: Path, *, fixed: bool) -> tuple[Any, Any]:
+    """Robot and scene in SAPIEN, under gravity."""
     import sapien
 
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
     scene.set_timestep(1 / 240)
     loader = scene.create_urdf_loader()
-    loader.fix_root_link = True
+    loader.fix_root_link = fixed
     builder = loader.load_file_as_articulation_builder(str(urdf))
     for link in builder.link_builders:
         link.visual_records.clear()  # they need a renderer
-    robot = builder.build()
+    return builder.build(), scene
+
+
+def drives(urdf: Path) -> bool:
+    """Whether SAPIEN loads it and its joints go from end to end and back as they are told."""
+    robot, scene = simulated(urdf, fixed=True)
     low, high = robot.get_qlimits().T
     for joint in robot.active_joints:
         joint.set_drive_properties(stiffness=4000, damping=130, mode="acceleration")
@@ -279,9 +266,27 @@ def drives(urdf: Path) -> bool:
     return True
 
 
+def rests(urdf: Path, state: dict[str, float]) -> bool:
+    """Whether it falls onto a floor, joints loose, and lies there after `FALL` seconds."""
+    robot, scene = simulated(urdf, fixed=False)
+    low, high = robot.get_qlimits().T
+    robot.set_qpos(np.array([state[joint.name] for joint in robot.active_joints]))
+    bounds = np.array([link.compute_global_aabb_tight() for link in robot.links])
+    size = float(np.linalg.norm(bounds[:, 1].max(0) - bounds[:, 0].min(0)))
+    scene.add_ground(float(bounds[:, 0, 2].min()) - 0.1 * size, render=False)
+    for _ in range(int(FALL * 240)):
+        scene.step()
+        over = np.maximum(low - robot.qpos, robot.qpos - high).max()
+        speed = np.linalg.norm(robot.root_linear_velocity)
+        if not (over < 0.1 and speed < 10 * np.sqrt(9.81 * size) + 1):  # NaN is neither
+            return False
+    still = np.linalg.norm(robot.root_linear_velocity) < 0.1 * np.sqrt(9.81 * size)
+    return bool(still and np.abs(robot.qvel).max() < 0.5)
+
+
 def measure(category: str, found: list[Sample]) -> str:
     """The row of a category."""
-    loaded = driven = 0
+    loaded = driven = rested = 0
     errors = []
     with tempfile.TemporaryDirectory() as folder:
         for k, one in enumerate(found):
@@ -289,11 +294,12 @@ def measure(category: str, found: list[Sample]) -> str:
             errors.append(chamfers(one, urdf))
             loaded += 1  # by yourdfpy, in `chamfers`
             driven += drives(urdf)
+            rested += rests(urdf, articulated(one.twin).state)
     table = np.array(errors)
     straight = sum(one.direction <= HINGE for one in found)
     near = sum(one.pivot <= PIVOT for one in found)
     return (
-        f"{category:11s} {len(found):4d} {straight:6d} {near:6d} {driven:7d} {loaded:9d}   "
+        f"{category:11s} {len(found):4d} {straight:6d} {near:6d} {driven:7d} {rested:7d} {loaded:9d}   "
         f"{table[:, 0].mean():6.2f} {table[:, 0].max():6.2f}   "
         f"{table[:, 1:].mean():6.2f} {table[:, 1:].max():6.2f}"
     )
@@ -304,14 +310,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("category", nargs="+")
-    parser.add_argument("--split", default="val")
+    parser.add_argument("--split", default="test")
     parser.add_argument("--count", type=int, default=20)
-    parser.add_argument("--predictions", type=Path)
+    parser.add_argument("--model")
     parser.add_argument("--source", type=Path)
     parser.add_argument("--bare", action="store_true")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    print("category       n  hinge  pivot  SAPIEN  yourdfpy  as observed    other states")
+    print("category       n  hinge  pivot  SAPIEN   rests  yourdfpy  as observed    other states")
     for category in given.category:
         split = open_split(given.data, category, given.split)
         print(measure(category, samples(split, given)), flush=True)

@@ -131,6 +131,17 @@ def test_normals_of_seen_points_look_at_the_camera():
     assert cosine[inner[seen]].min() > 0.99
 
 
+def test_where_nobody_saw_a_plate_a_dense_depth_image_tears_no_holes():
+    """Most samples are then observed ones, whose spacing is none that the model's can be met by."""
+    model = box_samples((0.6, 0.4, 0.02))
+    x, y = np.meshgrid(np.linspace(-0.3, 0.2, 120), np.linspace(-0.2, 0.2, 96))
+    points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.01)])
+    mesh = closed_mesh(joined(model, seen_samples(points, np.array([0.0, 0.0, 5.0]))))
+    check_closed(mesh)
+    assert mesh.euler_number == 2
+    assert farthest(mesh, model.points) < STEP / 2
+
+
 def test_observed_points_take_the_place_of_the_models():
     model = box_samples((0.4, 0.5, 0.6))
     top = model.points[:, 2] > 0.299
