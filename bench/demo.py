@@ -180,7 +180,7 @@ def make_table(demo: Demo, console: Console) -> Table:
 
 
 def summary(demo: Demo, cells: Sequence[Mapping[str, str]]) -> Table:
-    """Our rows and the paper's SCAPO and ICP, for the demo's categories."""
+    """Our rows, by method alone, and the paper's SCAPO and ICP, for the demo's categories."""
     columns = [name.capitalize() for name in demo.categories]
     table = Table("metric", "method", *columns, title="Table 1, the demo's part")
     rows: dict[str, dict[str, dict[str, str]]] = {}
@@ -188,7 +188,7 @@ def summary(demo: Demo, cells: Sequence[Mapping[str, str]]) -> Table:
         shown = cell["method"] in PRINTED if cell["source"] == "paper" else answers(cell["method"])
         shown = shown and cell["block"].split()[0] in METRICS
         if shown and cell["value"] and cell["column"] in columns:
-            method = f"{cell['method']}, {cell['source']}"
+            method = f"{cell['method'].partition(' (')[0]}, {cell['source']}"
             values = rows.setdefault(cell["block"], {}).setdefault(method, {})
             values[cell["column"]] = cell_text(float(cell["value"]))
     for block, methods in rows.items():

@@ -17,6 +17,7 @@ from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
 from bench.requests import UsageError
 from scapo.interrupt import exit_interrupted
+from scapo.text import did_you_mean
 
 DESCRIPTION = (
     "Train, predict, score and tabulate methods of articulated pose estimation "
@@ -32,6 +33,23 @@ def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 
     return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
 
 
+def _check_names(words: Sequence[str]) -> None:
+    """Refuse a verb or a method that is none, with the one that looks like it.
+
+    Raises:
+        UsageError: Naming those that there are.
+    """
+    kinds = [("verb", VERBS)]
+    if words[:1] == ["train"]:
+        from bench.methods import all_methods
+
+        kinds.append(("method", all_methods()))
+    for word, (kind, known) in zip(words, kinds, strict=False):
+        if not word.startswith("-") and word.replace("_", "-") not in known:
+            found = f"expected one of {', '.join(known)}, found none"
+            raise UsageError(f"{kind} {word!r}: {found}{did_you_mean(word, known)}")
+
+
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run one verb; other ends than success by `SystemExit`."""
     words, preset = prepare(sys.argv[1:] if arguments is None else arguments)
@@ -43,6 +61,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
         format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )
     try:
+        _check_names(words)
         command: Any = tyro.cli(
             _commands(words[:1], preset),
             prog="scapo-bench",

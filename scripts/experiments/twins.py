@@ -299,7 +299,8 @@ def measure(category: str, found: list[Sample]) -> str:
     straight = sum(one.direction <= HINGE for one in found)
     near = sum(one.pivot <= PIVOT for one in found)
     return (
-        f"{category:11s} {len(found):4d} {straight:6d} {near:6d} {driven:7d} {rested:7d} {loaded:9d}   "
+        f"{category:11s} {len(found):4d} {straight:6d} {near:6d} {driven:7d} {rested:7d} "
+        f"{loaded:9d}   "
         f"{table[:, 0].mean():6.2f} {table[:, 0].max():6.2f}   "
         f"{table[:, 1:].mean():6.2f} {table[:, 1:].max():6.2f}"
     )

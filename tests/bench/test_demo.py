@@ -50,7 +50,7 @@ def test_summary_shows_ours_beside_print_for_the_demo_categories_only() -> None:
     rows = [row for row in rows if row]
     assert rows == [
         ["S", "SCAPO, paper", "93.41", "–"],
-        ["", "SCAPO (cpu), ours", "56.97", "–"],
+        ["", "SCAPO, ours", "56.97", "–"],
         ["t", "ICP, ours", "–", "0.082"],
     ]
 
