@@ -53,7 +53,7 @@ them are asked for their nearest."""
 SHARES = (0.05, 0.35, 0.65, 0.95)
 """Of the travel: the other states."""
 HINGE, PIVOT = 5.0, 0.05
-FALL = 4.0
+FALL = 8.0
 """Seconds of simulation that a twin has to come to rest."""
 
 
