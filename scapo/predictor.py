@@ -129,7 +129,7 @@ def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:
     """A trained model, of the library's own methods or of another package's.
 
     >>> from safetensors.numpy import load_file  # here a cloud from a checkout of the project
-    >>> points = load_file("results/checks/oven.safetensors")["points"][0]  # (1024, 3), metres
+    >>> points, *_ = load_file("results/checks/oven.safetensors")["points"]  # (1024, 3), metres
     >>> found = load("oven").predict(points)
     >>> found.joints.axis.shape, found.joints.state.shape, found.camera_T_part.shape
     (torch.Size([1, 3]), torch.Size([1]), torch.Size([2, 4, 4]))
