@@ -17,12 +17,12 @@ def uniform(parameter: Tensor, bound: float, generator: torch.Generator) -> None
 def initialise(module: nn.Module, generator: torch.Generator) -> None:
     """Draw every weight below `module` anew, in the order of `modules()`.
 
-    Linear layers as PyTorch does, uniform in +-1/sqrt(inputs); a module of ours with a method
-    `reset(generator)` by that. Nothing touches the global random state.
+    Linear and convolutional layers as PyTorch does, uniform in +-1/sqrt(inputs); a module of ours
+    with a method `reset(generator)` by that. Nothing touches the global random state.
     """
     for child in module.modules():
-        if isinstance(child, nn.Linear):
-            bound = child.in_features**-0.5
+        if isinstance(child, nn.Linear | nn.Conv2d):
+            bound = child.weight[0].numel() ** -0.5
             uniform(child.weight, bound, generator)
             if child.bias is not None:
                 uniform(child.bias, bound, generator)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from scapo.geometry.numerics import exact, uncompiled
@@ -43,6 +44,24 @@ def k_nearest(
         ValueError: `target` has fewer than k points.
     """
     return _search(source, target, k)
+
+
+@torch.no_grad()
+def k_nearest_by_tree(
+    source: Float[Tensor, "N D"], target: Float[Tensor, "M D"], k: int
+) -> Int[Tensor, "N {k}"]:
+    """The same as `k_nearest` of one cloud, on a CPU by a k-d tree.
+
+    In few dimensions, with a thousand points and a dozen neighbours, several times as fast. Of
+    neighbours that are equally far either may come first.
+
+    Raises:
+        ValueError: `target` has fewer than k points.
+    """
+    if source.device.type != "cpu" or not 1 <= k <= len(target):
+        return k_nearest(source, target, k)
+    _, index = KDTree(target.numpy()).query(source.numpy(), k=k)
+    return torch.from_numpy(np.asarray(index, np.int64).reshape(-1, k))
 
 
 @uncompiled  # blocks, numpy and exact arithmetic are no matter for a compiler

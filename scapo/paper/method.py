@@ -45,9 +45,10 @@ from scapo.paper.objectives import Explanation, articulation, canonicalisation
 from scapo.paper.part_search import PartSearch, Skeleton, motionless
 from scapo.paper.refine import nearest_template_weights, refine
 from scapo.paper.skinning import Bones, cross_maps, part_maps
-from scapo.paper.warm_start import WarmStart, imitation, load_run
+from scapo.paper.warm_start import WarmStart, imitation
 from scapo.pictures import PictureData
 from scapo.records import cat, map_tensors, take
+from scapo.registered.method import load_run
 from scapo.types import Joints, Labels, Observation, Prediction
 
 

@@ -13,14 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo.categories import Category
 from scapo.geometry.points import chamfer, normalise
 from scapo.geometry.rigid import apply, invert, joint_motion, rigid
 from scapo.method import AbstractMethod, Mode
@@ -30,16 +28,6 @@ from scapo.paper.first_targets import Lying
 from scapo.paper.objectives import LossConfig
 from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
 from scapo.records import cat, map_tensors, take
-from scapo.registered.config import RegisteredConfig
-from scapo.registered.method import TemplateRegistration
-from scapo.store.checkpoint import (
-    check_header,
-    config_from,
-    header_category,
-    load_arrays,
-    read_checkpoint,
-)
-from scapo.store.schema import StoreError
 from scapo.types import Observation
 
 POINTS = 1024
@@ -254,25 +242,6 @@ class WarmStart:
             axis=joints.axis @ base[:, :3, :3],
             state=torch.where(slide, joints.state * scale, joints.state),
         )
-
-
-def load_run(path: Path, category: Category) -> TemplateRegistration:
-    """The trained model of a `registered` run folder or checkpoint file.
-
-    Raises:
-        StoreError: None there, of another method, or of another category.
-    """
-    arrays, header = read_checkpoint(path)
-    kind = header_category(check_header(header, str(path)), str(path))
-    if header["method"] != TemplateRegistration.name or kind != category:
-        raise StoreError(
-            f"{path}: expected a run of {TemplateRegistration.name} on {category.name}, "
-            f"found one of {header['method']} on {kind.name}"
-        )
-    config = config_from(RegisteredConfig, header["config"], f"{path}: config")
-    method = TemplateRegistration(config, kind, torch.Generator())
-    load_arrays(method, arrays, path)
-    return method.eval()
 
 
 def imitation(

@@ -14,7 +14,6 @@ from scapo.geometry.points import Similarity, k_nearest
 from scapo.geometry.rigid import rigid
 from scapo.registered.joint_limits import JointLimits
 from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
-from scapo.registered.views import surface_normals
 from scapo.types import Joints, Prediction
 
 NEIGHBOURS = 12  # Template points that tell the part of an observed one
@@ -114,11 +113,10 @@ def canonical_surface(
 def nearest_weights(
     template: ArticulatedTemplate,
     points: Float[Tensor, "B N 3"],
+    normals: Float[Tensor, "B N 3"],
     placement: Placement,
-    camera: Float[Tensor, "B 3"],
 ) -> Float[Tensor, "B N P"]:
     """Part weights of the placed template's points that are nearest in position and normal."""
-    normals = surface_normals(points, points, camera)
     placed, placed_normals = template.place(placement)
     source, target = oriented(points, normals), oriented(placed, placed_normals)
     weight = template.logit.softmax(-1)

@@ -28,10 +28,10 @@ from scapo.geometry.points import Similarity, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.method import changes
 from scapo.records import take
+from scapo.registered.base import AbstractRegistered, LearnedClouds
 from scapo.registered.config import UNNAMED, SearchConfig
 from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
-from scapo.registered.method import AbstractRegistered, LearnedClouds
 from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.pose_search import SearchResult
 from scapo.registered.template import (

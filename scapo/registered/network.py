@@ -3,10 +3,10 @@
 
 A plain point network is given a cloud in some frame and says where every point lies on the placed
 template (template axes, this cloud's size and state), how sure it is, and which part it belongs to;
-a weighted Procrustes step turns the votes into a pose. The frame is one in which the object may
-stand (`orientation`), or one of the four proper frames of the cloud's principal axes, a set that
-does not change when the cloud is turned or moved; of those the one whose points are surest wins.
-Learned towards the placements that search and bundle adjustment found.
+a weighted Procrustes step turns the votes into a pose. The frame is one of the four proper frames
+of the cloud's principal axes, a set that does not change when the cloud is turned or moved; of
+those the one whose points are surest wins. Learned towards the placements that search and bundle
+adjustment found. It is asked where nobody knows the camera; elsewhere `view_network` is.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from torch import Tensor, nn
 from scapo.geometry.points import MEAN_RADIUS, gather, k_nearest
 from scapo.geometry.rigid import project_rotation
 from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.records import take
+from scapo.registered.template import Placement
 
 SIGNS = ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
 """Flips of the principal axes that keep the frame right-handed."""
 FRAMES = len(SIGNS)  # Principal frames of a cloud
-STANDING, ASKEW, TURN = 0.5, 0.25, 0.15
-"""Share of the clouds that are learned as they stand, as `fast` asks, and the standard deviations
-of the turns away from that frame and from a principal one, rad."""
+TURN = 0.15  # Rad: standard deviation of the turn away from a principal frame while learning
 CAMERA_UNIT = 4.0  # Camera positions are learned in this many normalised units
 WIDTH, NEIGHBOURS = 48, 12
 """Channels of the narrowest layer, and nearest points that the first one sees."""
@@ -136,25 +136,19 @@ def principal_frames(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 4 3 3"]
 
 
 def random_frames(
-    points: Float[Tensor, "B K 3"],
-    standing: Float[Tensor, "B 3 3"],
-    generator: torch.Generator,
+    points: Float[Tensor, "B K 3"], generator: torch.Generator
 ) -> Float[Tensor, "B 3 3"]:
-    """A frame of each cloud to learn in: one of its principal ones or that in which it stands.
+    """One of each cloud's principal frames, turned a little, to learn in.
 
     Args:
         points: Of each cloud.
-        standing: template_R_cloud.
         generator: On the device of the points.
     """
     device, count = points.device, len(points)
     pick = torch.randint(FRAMES, (count,), generator=generator, device=device)
     frames = principal_frames(points)[torch.arange(count, device=device), pick]
-    draw = torch.rand(count, generator=generator, device=device)
     turn = torch.randn(count, 3, generator=generator, device=device)
-    stands = (draw < STANDING)[:, None]
-    frames = torch.where(stands[..., None], standing, frames)
-    return rotvec_to_rotmat(torch.where(stands, ASKEW, TURN) * turn) @ frames
+    return rotvec_to_rotmat(TURN * turn) @ frames
 
 
 def own_frame(points: Float[Tensor, "B K 3"]) -> Float[Tensor, "B 3 3"]:
@@ -214,3 +208,33 @@ def vote_losses(votes: Votes, target: Target) -> dict[str, Tensor]:
         "camera": camera,
     }
     return {name: (trust * (WEIGHTS[name] * value)).sum() for name, value in terms.items()}
+
+
+def in_principal_frames(
+    network: PointVotes, points: Float[Tensor, "B K 3"]
+) -> tuple[Placement, Votes, Float[Tensor, "B 4"]]:
+    """Placements from the four frames of each cloud, in a row, the votes, and how sure they are."""
+    frames = principal_frames(points).flatten(0, 1)
+    turned = points.repeat_interleave(FRAMES, 0) @ frames.mT
+    votes = network(turned)
+    weight = votes.sureness.sigmoid().square()
+    rotation, translation = procrustes(turned, votes.points, weight)
+    placement = Placement(
+        rotation=frames.mT @ rotation,
+        translation=(frames.mT @ translation[..., None])[..., 0],
+        log_scale=votes.log_scale,
+        state=votes.state,
+        shift=votes.shift,
+        deviation=torch.zeros_like(votes.shift),
+    )
+    return placement, votes, weight.mean(1).view(len(points), FRAMES)
+
+
+def surest(
+    network: PointVotes, points: Float[Tensor, "B K 3"]
+) -> tuple[Placement, Votes, Float[Tensor, " B"]]:
+    """The placement in the frame in which the network is surest, its votes, how sure it is."""
+    placement, votes, sure = in_principal_frames(network, points)
+    best = sure.argmax(1)
+    row = torch.arange(len(points), device=points.device) * FRAMES + best
+    return take(placement, row), take(votes, row), sure.gather(1, best[:, None])[:, 0]

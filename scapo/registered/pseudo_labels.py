@@ -3,16 +3,64 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import torch
+from jaxtyping import Bool, Float, Int8, UInt8
 from torch import Tensor, nn
 
 from scapo.registered.template import Placement
 from scapo.registered.view_bank import ShownPoints
 
 
-class PseudoLabels(nn.Module):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidates:
+    """A few placements of each of B clouds between which the search found little to choose."""
+
+    placement: Placement
+    """B * C of them, those of a cloud in a row."""
+    part: UInt8[Tensor, "B C N"]
+    """Which part each point is of, by each."""
+    gap: Float[Tensor, "B C"]
+    """By how much each costs the search more than the best."""
+    margin: Float[Tensor, " B"]
+    """How far to trust the best, the more the surer."""
+    inlier: Bool[Tensor, "B N"]
+    normals: Int8[Tensor, "B N 3"]
+    """In the frame of the placements, times 127."""
+
+
+class _Tensors(nn.Module):
+    """Named tensors whose size is that of what was stored."""
+
+    NAMES: ClassVar[tuple[str, ...]]
+    LATER: ClassVar[tuple[str, ...]] = ()
+    """Those that older checkpoints lack; they then stay empty."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in self.NAMES:
+            self.register_buffer(name, torch.zeros(0))
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        *rest: Any,  # noqa: ANN401 - as torch calls it
+        **named: Any,  # noqa: ANN401
+    ) -> None:
+        """Take the size of what is loaded."""
+        for name in self.LATER:
+            state_dict.setdefault(prefix + name, torch.zeros(0))
+        for name, own in self.named_buffers():
+            if prefix + name in state_dict:
+                empty = torch.zeros_like(state_dict[prefix + name], device=own.device)
+                setattr(self, name, empty)
+        super()._load_from_state_dict(state_dict, prefix, *rest, **named)
+
+
+class PseudoLabels(_Tensors):
     """Placements of training clouds as found, in the order of those clouds."""
 
     key: Tensor
@@ -32,19 +80,18 @@ class PseudoLabels(nn.Module):
     belonging: Tensor
     """Which points of each cloud are inliers (bool)."""
     PLACEMENT: ClassVar = ("rotation", "translation", "log_scale", "state", "shift")
-    NAMES: ClassVar = ("key", *PLACEMENT, "camera", "trust")
-    SHOWN: ClassVar = ("points", "normals")
+    SET: ClassVar = ("key", *PLACEMENT, "camera", "trust")
+    LATER: ClassVar[tuple[str, ...]] = ("points", "normals")
+    NAMES: ClassVar[tuple[str, ...]] = (*SET, *LATER)
 
     def __init__(self) -> None:
         super().__init__()
-        for name in (*self.NAMES, *self.SHOWN):
-            self.register_buffer(name, torch.zeros(0))
         self.register_buffer("belonging", torch.ones(0, 0, dtype=torch.bool))
 
     def set(self, key: Tensor, placement: Placement, camera: Tensor, trust: Tensor) -> None:
         """Replace all."""
         values = (key, *(getattr(placement, name) for name in self.PLACEMENT), camera, trust)
-        for name, value in zip(self.NAMES, values, strict=True):
+        for name, value in zip(self.SET, values, strict=True):
             setattr(self, name, value.detach().clone())
 
     def show(self, shown: ShownPoints) -> None:
@@ -54,7 +101,7 @@ class PseudoLabels(nn.Module):
     def keep_trusted(self) -> None:
         """Forget the clouds that nothing is learned from, and which points are whose."""
         kept = self.trust > 0
-        for name in (*self.NAMES, *self.SHOWN):
+        for name in self.NAMES:
             values = getattr(self, name)
             setattr(self, name, values[kept] if len(values) == len(kept) else values)
         self.belonging = self.belonging[:0, :0]
@@ -64,18 +111,38 @@ class PseudoLabels(nn.Module):
         values = {name: getattr(self, name) for name in self.PLACEMENT}
         return Placement(**values, deviation=torch.zeros_like(self.shift))
 
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        *rest: Any,  # noqa: ANN401 - as torch calls it
-        **named: Any,  # noqa: ANN401
-    ) -> None:
-        """Take the size of what is loaded; older checkpoints have no points."""
-        for name in self.SHOWN:
-            state_dict.setdefault(prefix + name, torch.zeros(0))
-        for name in (*self.NAMES, *self.SHOWN, "belonging"):
-            if prefix + name in state_dict:
-                empty = torch.zeros_like(state_dict[prefix + name], device=self.key.device)
-                setattr(self, name, empty)
-        super()._load_from_state_dict(state_dict, prefix, *rest, **named)
+
+class ViewTargets(_Tensors):
+    """Candidates as a part of the method's state, which training alone needs."""
+
+    PLACEMENT: ClassVar = tuple(item.name for item in fields(Placement))
+    NAMES: ClassVar[tuple[str, ...]] = (*PLACEMENT, "part", "gap", "trust", "inlier", "normals")
+    LATER: ClassVar[tuple[str, ...]] = NAMES
+    log_scale: Tensor
+    shift: Tensor
+    deviation: Tensor
+    part: Tensor
+    gap: Tensor
+    trust: Tensor
+    """Weight of each cloud when the network learns."""
+    inlier: Tensor
+    normals: Tensor
+
+    def set(self, found: Candidates, trust: Float[Tensor, " B"]) -> None:
+        """Replace all."""
+        count = found.gap.shape[1]
+        for name in self.PLACEMENT:
+            setattr(self, name, getattr(found.placement, name).unflatten(0, (-1, count)))
+        self.part, self.gap, self.inlier = found.part, found.gap, found.inlier
+        self.normals = found.normals
+        self.trust = trust
+
+    def placement(self, row: Tensor) -> Placement:
+        """All candidates of some clouds, those of a cloud in a row."""
+        values = {name: getattr(self, name)[row].flatten(0, 1) for name in self.PLACEMENT}
+        return Placement(**values)
+
+    def clear(self) -> None:
+        """Forget all."""
+        for name in self.NAMES:
+            setattr(self, name, torch.zeros(0, device=self.trust.device))

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.geometry.points import farthest_points, gather, k_nearest
+from scapo.geometry.points import farthest_points, gather, k_nearest_by_tree
 from scapo.geometry.rigid import rotation_between
 
 FAR = 1e3  # Depth of a cell that shows background, in normalised lengths: beyond all that is tried
@@ -106,7 +106,7 @@ def observe(
     if index is None:
         index = farthest_points(points, min(count, points.shape[1]))
     kept = gather(points, index)
-    look = _look(camera)
+    look = look_along(camera)
     depth, centre, half = _depth_image(points, camera, look)
     return PartialViews(
         points=kept,
@@ -123,9 +123,8 @@ def surface_normals(
     points: Float[Tensor, "B K 3"], cloud: Float[Tensor, "B N 3"], camera: Float[Tensor, "B 3"]
 ) -> Float[Tensor, "B K 3"]:
     """Direction of least spread of the nearest points of `cloud`, turned towards the camera."""
-    around = torch.cat(
-        [_neighbours(p[None], c[None], NEIGHBOURS) for p, c in zip(points, cloud, strict=True)]
-    )
+    near = zip(points, cloud, strict=True)
+    around = torch.stack([c[k_nearest_by_tree(p, c, NEIGHBOURS)] for p, c in near])
     around = around - around.mean(-2, keepdim=True)
     _, vectors = torch.linalg.eigh(around.mT @ around)
     normal = vectors[..., 0]
@@ -133,14 +132,7 @@ def surface_normals(
     return torch.where(facing < 0, -normal, normal)
 
 
-def _neighbours(
-    points: Float[Tensor, "B K 3"], cloud: Float[Tensor, "B N 3"], k: int
-) -> Float[Tensor, "B K {k} 3"]:
-    index = k_nearest(points, cloud, k)
-    return gather(cloud, index.flatten(1)).unflatten(1, index.shape[1:])
-
-
-def _look(camera: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 3"]:
+def look_along(camera: Float[Tensor, "B 3"]) -> Float[Tensor, "B 3 3"]:
     """The smallest rotation that takes the direction from the camera to the origin to z."""
     forward = F.normalize(-camera, dim=-1)
     return rotation_between(forward, torch.eye(3).to(camera)[2].expand_as(forward))

@@ -26,6 +26,7 @@ from scapo.registered.decode import nearest_weights, placed_prediction
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.template import turn_placement
 from scapo.registered.view_bank import ShownPoints
+from scapo.registered.views import surface_normals
 from scapo.store import Split
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.store.samples import UNLABELLED
@@ -68,7 +69,8 @@ class Told(AbstractMethod):
         placement = turn_placement(placement, rotvec_to_rotmat(turn))
         similarity = Similarity(scale=torch.ones(len(row)), centre=centres[row])
         points, camera = similarity.forward(observation.points), self.views.camera[row]
-        weight = nearest_weights(self.template, points, placement, camera)
+        normals = surface_normals(points, points, camera)
+        weight = nearest_weights(self.template, points, normals, placement)
         sure = torch.tensor([0.1 if int(r) in self.wrong else 0.9 for r in row])
         return placed_prediction(self.template, placement, weight, similarity, sure)
 

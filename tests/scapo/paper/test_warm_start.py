@@ -21,7 +21,8 @@ from scapo.paper.config import warm_config
 from scapo.paper.first_targets import first_targets
 from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
 from scapo.paper.skinning import cross_maps, deform, part_maps
-from scapo.paper.warm_start import Exchange, Told, WarmStart, imitation, load_run
+from scapo.paper.warm_start import Exchange, Told, WarmStart, imitation
+from scapo.registered.method import load_run
 from scapo.store.schema import StoreError
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.placed import Told as Oracle

@@ -20,6 +20,7 @@ from scapo.registered.decode import (
 )
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.template import ArticulatedTemplate, Placement
+from scapo.registered.views import surface_normals
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
@@ -77,8 +78,9 @@ def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
 
 def test_weights_come_from_the_part_that_is_there():
     views, truth = sighted(2, seed=70)
-    weight = nearest_weights(template(), views.points, truth, views.camera)
-    fine = nearest_weights(template(seed=9, count=3000), views.points, truth, views.camera)
+    normals = surface_normals(views.points, views.points, views.camera)
+    weight = nearest_weights(template(), views.points, normals, truth)
+    fine = nearest_weights(template(seed=9, count=3000), views.points, normals, truth)
     assert (weight.argmax(-1) == fine.argmax(-1)).float().mean() > 0.95
     assert_close(weight.sum(-1), torch.ones(2, views.points.shape[1]), atol=1e-5, rtol=0)
 

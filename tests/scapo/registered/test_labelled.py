@@ -30,7 +30,7 @@ from tests.helpers.strategies import generator
 
 CONFIG = LabelledConfig(
     discovery=TemplateConfig(rotations=200, final_points=300),
-    points=128, width=8, grid_hypotheses=32, epochs=1,
+    points=128, channels=4, placed=30, grid_hypotheses=32, epochs=1,
 )  # fmt: skip
 CATEGORY: dict[JointKind, str] = {"revolute": "oven", "prismatic": "drawer"}
 

@@ -37,7 +37,14 @@ DISCOVERY = DiscoveryConfig(
 
 
 CONFIG = RegisteredConfig(
-    discovery=DISCOVERY, learned=20, epochs=2, points=128, width=8, batch=8, grid_hypotheses=16
+    discovery=DISCOVERY,
+    learned=20,
+    placed=20,
+    epochs=2,
+    points=128,
+    channels=4,
+    batch=8,
+    grid_hypotheses=16,
 )
 
 
@@ -67,7 +74,7 @@ def test_a_template_at_hand_is_learned_stored_and_gone_on_with(
     )
     monkeypatch.setattr(room, "discover", lambda *_: made)
     data = TrainingData(observation=clouds(10), labels=Labels(), digest="here")
-    config = replace(CONFIG, learned=10)
+    config = replace(CONFIG, learned=10, placed=10)
 
     def stopping(progress: fit.Progress) -> None:
         if progress.epoch == 1:

@@ -1,0 +1,433 @@
+# SPDX-License-Identifier: MIT
+"""An articulated template, a network that says how it stands in a cloud, and the search for both.
+
+What `method` and its bound (`labelled`) share: all but where the template comes from.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from scapo.categories import Category, JointKind
+from scapo.first_weights import initialise
+from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
+from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
+from scapo.pictures import PictureData
+from scapo.records import cat, take
+from scapo.registered.axis_deviation import refine_deviations
+from scapo.registered.config import SearchConfig
+from scapo.registered.decode import metric_limits
+from scapo.registered.discovery import Discovery
+from scapo.registered.figures import template_pictures
+from scapo.registered.joint_limits import JointLimits, limits_of
+from scapo.registered.learning import (
+    SeenClouds,
+    candidates,
+    dissent,
+    taught,
+    taught_in_principal_frames,
+    undeviated,
+    voted,
+)
+from scapo.registered.network import (
+    PointVotes,
+    in_principal_frames,
+    own_frame,
+    surest,
+)
+from scapo.registered.orientation import VIEWS_CHARGE, OrientationScorer
+from scapo.registered.outliers import inlier_mask, replaced
+from scapo.registered.pose_search import (
+    BRIEF,
+    CHARGED,
+    THOROUGH,
+    SearchResult,
+    SearchSpace,
+    grid_of_states,
+    light,
+    modes_of,
+    most_confident,
+    refine_states,
+    successive_halving,
+)
+from scapo.registered.pseudo_labels import Candidates, PseudoLabels, ViewTargets
+from scapo.registered.template import (
+    ArticulatedTemplate,
+    Placement,
+    interleave,
+    turn_placement,
+)
+from scapo.registered.view_bank import ShownPoints, ViewBank
+from scapo.registered.view_network import ViewNetwork
+from scapo.registered.views import NEIGHBOURS, PartialViews, observe, surface_normals
+from scapo.types import Labels, Observation, Prediction
+
+logger = logging.getLogger(__name__)
+
+LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
+SAMPLED = 2  # Times `points` that are drawn from a cloud, of which the farthest are learned from
+LAST_RATE = 0.01  # Share of the learning rate at the end
+PLACED = 50  # Clouds that are placed at a time
+PLACING, LATE = 0.08, 0.8
+"""Seconds of one core for each of them, and the share of the start that is over before."""
+ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedClouds:
+    """The training clouds whose placements the network learns."""
+
+    index: Int[Tensor, " K"]
+    """Rows of all training clouds."""
+    similarity: Similarity
+    """Their normalisation."""
+    views: PartialViews
+
+
+class AbstractRegistered(AbstractMethod):
+    """An articulated template, the network that votes for its placement, and their training.
+
+    Where the template comes from, and what its placements say of part frames, is left open.
+    """
+
+    networks: ClassVar[tuple[str, ...]] = ("network",)
+    usual: ClassVar[Mode] = "quick"
+    least_points = NEIGHBOURS
+
+    def __init__(
+        self, config: SearchConfig, category: Category, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.config, self.category = config, category
+        kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
+        self.template = ArticulatedTemplate(kinds, config.discovery.final_points)
+        sizes = (len(category.parts), len(kinds))
+        known = config.camera == "known"
+        self.network = (
+            ViewNetwork(*sizes, channels=config.channels)
+            if known
+            else PointVotes(*sizes, width=config.width)
+        )
+        initialise(self.network, generator)
+        self.pseudo, self.targets = PseudoLabels(), ViewTargets()
+        self.orientation = OrientationScorer()
+        self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None
+
+    def stages(self) -> tuple[Stage, ...]:
+        """The network's; the template is found before it starts."""
+        stage = Stage(
+            name="votes",
+            epochs=self.config.epochs,
+            lr=self.config.lr,
+            min_lr=self.config.lr * LAST_RATE,
+            batch=self.config.batch,
+            clouds=self._taught(),
+            parameters=(ParameterGroup(module="network"),),
+        )
+        return (stage,)
+
+    def _taught(self) -> int:
+        """How many training clouds the network learns from."""
+        return self.config.placed if self.config.camera == "known" else self.config.learned
+
+    def start(
+        self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> None:
+        """Find the template, and its placement in the clouds that the network will learn."""
+        del stage
+        if len(observation.points) < LEAST_CLOUDS:
+            raise ValueError(
+                f"training data: expected at least {LEAST_CLOUDS} clouds, "
+                f"found {len(observation.points)}"
+            )
+        index = evenly(len(observation.points), self.config.learned)
+        self.journal.tell("first look at the clouds", 0.0, self._seconds(len(index)))
+        cloud = observation.points[index.to(observation.points.device)].cpu()
+        similarity, views, inlier = self._observed(cloud)
+        device = self.template.points.device
+        self.template.cpu()  # many small steps, view by view: no work for a GPU
+        seed = torch.randint(2**31, (1,), generator=generator, device=generator.device)
+        learned = LearnedClouds(index=index, similarity=similarity, views=views)
+        made = self._found(learned, observation, labels, torch.Generator().manual_seed(int(seed)))
+        self.template.load_state_dict(made.template.state_dict())
+        self._set_pseudo_labels(cloud[:, 0], views, made.found)
+        self.pseudo.belonging = inlier
+        self._learn_orientation(views, made, seed)
+        self.network.cpu()
+        self._place(observation.points, generator)
+        self.to(device)
+
+    def _place(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
+        """Find what the network learns, as `quick` would, which keeps a few candidates."""
+        if not isinstance(self.network, ViewNetwork):
+            return
+        index = evenly(len(cloud), self.config.placed).to(cloud.device)
+        self.journal.tell(f"placing {len(index)} clouds", LATE, PLACING * len(index))
+        host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
+        found = self.journal.once(
+            "placed clouds",
+            lambda: cat([self._candidates(some) for some in cloud[index].cpu().split(PLACED)]),
+            host,
+            {kind.__name__: kind for kind in (Candidates, Placement)},
+        )
+        trust = torch.zeros_like(found.margin)
+        count = max(1, round(self.config.trusted * len(trust)))
+        trust[found.margin.topk(count).indices] = 1.0
+        self.targets.set(found, trust)
+        self.network.learned.fill_(1.0)
+
+    def _candidates(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
+        limits = self._limits().wider(CHARGED)
+        seen = self._seen(Observation(points=cloud))
+        return candidates(self.template, seen, self._space(), limits, self.config.quick_hypotheses)
+
+    def _observed(
+        self, cloud: Float[Tensor, "B N 3"]
+    ) -> tuple[Similarity, PartialViews, Bool[Tensor, "B N"]]:
+        """Clouds of the training data as views, their normalisation and their inliers."""
+        inlier = self._inlier_mask(cloud)
+        points, similarity = normalise(replaced(cloud, inlier))
+        camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
+        return similarity, observe(points, camera, count=self.config.points), inlier
+
+    @abstractmethod
+    def _seconds(self, clouds: int) -> float:
+        """How long finding the template usually takes, with so many learned clouds, on one core."""
+
+    @abstractmethod
+    def _found(
+        self,
+        learned: LearnedClouds,
+        observation: Observation,
+        labels: Labels,
+        generator: torch.Generator,
+    ) -> Discovery:
+        """The template, and its placement in the learned clouds; on the host.
+
+        Args:
+            learned: Those clouds.
+            observation: All training clouds.
+            labels: Of all, as allowed by `supervision`.
+            generator: On the host.
+        """
+
+    @abstractmethod
+    def _prediction(
+        self,
+        placement: Placement,
+        part_weight: Float[Tensor, "B N P"],
+        similarity: Similarity,
+        confidence: Float[Tensor, " B"],
+    ) -> Prediction:
+        """What a placement in normalised frames stands for."""
+
+    def _inlier_mask(self, cloud: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
+        """Which points belong to the object; all where outliers are kept."""
+        if self.config.strays == "kept":
+            return torch.ones(cloud.shape[:2], dtype=torch.bool, device=cloud.device)
+        return inlier_mask(cloud)
+
+    def _set_pseudo_labels(self, key: Tensor, views: PartialViews, found: SearchResult) -> None:
+        trust = torch.zeros_like(found.loss)
+        trust[most_confident(found, self.config.trusted)] = 1.0
+        placement = found.placement
+        away = views.camera - placement.translation
+        camera = (placement.rotation.mT @ away[..., None])[..., 0]
+        self.pseudo.set(key, placement, camera, trust)
+        self.pseudo.show(ShownPoints.of(views))
+
+    def _learn_orientation(self, views: PartialViews, made: Discovery, seed: Tensor) -> None:
+        """From objects that know better, or else from the views that are placed most surely."""
+        scorer, sure = made.scorer, (self.pseudo.trust > 0).cpu()
+        if scorer is None:
+            generator = torch.Generator().manual_seed(int(seed))
+            rotation = made.found.placement.rotation[sure]
+            scorer = OrientationScorer()
+            scorer.learn(take(views, sure), rotation, generator, price=VIEWS_CHARGE)
+        self.orientation.load_state_dict(scorer.state_dict())
+
+    def strip(self) -> None:
+        """Keep of the training clouds what `quick` and `refine` look at: those placed surely."""
+        self.pseudo.keep_trusted()
+        self.targets.clear()
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        """The network's votes against the placements that were found (`vote_losses`)."""
+        del labels
+        row = self._learned_row(step)
+        if isinstance(self.network, ViewNetwork):
+            clouds, count = (observation.points, row), self.config.points
+            return taught(self.network, self.template, self.targets, clouds, count, step.generator)
+        clouds, count = (observation.points, row), self.config.points
+        return taught_in_principal_frames(
+            self.network, self.template, self.pseudo, clouds, count, step.generator
+        )
+
+    def _learned_row(self, step: Step) -> Int[Tensor, " B"]:
+        """Which of the learned clouds a batch holds.
+
+        Raises:
+            ValueError: A cloud whose placement was not searched for.
+        """
+        learned = evenly(step.total, self._taught()).to(step.index.device)
+        row = torch.searchsorted(learned, step.index).clamp(max=len(learned) - 1)
+        if bool((learned[row] != step.index).any()):
+            raise ValueError("expected clouds whose placements were found, found others")
+        return row
+
+    def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
+        """The template over its states, and where the network places it."""
+        del stage
+        seen = self._seen(observation)
+        placement = self._voted(seen)[0]
+        return template_pictures(self.template, self._limits(), seen.views.points, placement)
+
+    @torch.no_grad()
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
+        """Parts, poses and joints."""
+        seen = self._seen(observation)
+        if mode == "fast" and self._has_learned():
+            chosen, weight, confidence = self._voted(seen)
+        else:
+            chosen, confidence = self._searched(seen, mode)
+            weight = seen.part_weights(self.template, chosen)
+        chosen = turn_placement(chosen, seen.frame.mT)
+        return self._answer(chosen, weight, seen.similarity, confidence)
+
+    def _has_learned(self) -> bool:
+        """Whether there is a network to ask: not in models from before cameras were asked for it.
+
+        One that was never trained has nothing else.
+        """
+        if isinstance(self.network, PointVotes) or not len(self.pseudo.state):
+            return True
+        return bool(self.network.learned)
+
+    def _seen(self, observation: Observation) -> SeenClouds:
+        """Clouds in frames of their own, so that grids of rolls and images turn with them."""
+        cloud = observation.points.to(self.template.points)
+        inlier = self._inlier_mask(cloud)
+        clean, similarity = normalise(replaced(cloud, inlier))
+        index = farthest_points(clean, min(self.config.points, clean.shape[1]))
+        kept = gather(clean, index)
+        camera, frame = self._camera(observation, similarity, kept), own_frame(kept)
+        views = observe(clean @ frame.mT, (frame @ camera[..., None])[..., 0], index=index)
+        points = similarity.forward(cloud) @ frame.mT
+        return SeenClouds(
+            points=points, clean=clean @ frame.mT, views=views, frame=frame,
+            similarity=similarity, inlier=inlier,
+            normals=surface_normals(clean @ frame.mT, clean @ frame.mT, views.camera),
+        )  # fmt: skip
+
+    def _voted(
+        self, seen: SeenClouds
+    ) -> tuple[Placement, Float[Tensor, "B N P"], Float[Tensor, " B"]]:
+        """What the network alone says: placement, part weights, and how sure it is."""
+        if isinstance(self.network, PointVotes):
+            kept = seen.views.points
+            placement, votes, sure = surest(self.network, kept)
+            return placement, gather(votes.part.softmax(-1), nearest(seen.points, kept)), sure
+        return voted(self.network, self.template, seen)
+
+    def _answer(
+        self,
+        placement: Placement,
+        part_weight: Float[Tensor, "B N P"],
+        similarity: Similarity,
+        confidence: Float[Tensor, " B"],
+    ) -> Prediction:
+        """`_prediction`, with the states that were seen in training as limits."""
+        plain = self._prediction(placement, part_weight, similarity, confidence)
+        if not bool((self.pseudo.trust > 0).any()):  # not trained yet
+            return plain
+        return replace(plain, joint_limits=metric_limits(self.template, self._limits(), similarity))
+
+    def _camera(
+        self, observation: Observation, similarity: Similarity, kept: Float[Tensor, "B K 3"]
+    ) -> Float[Tensor, "B 3"]:
+        """The camera's centre in the normalised frame of each cloud."""
+        if self.config.camera == "estimated":
+            assert isinstance(self.network, PointVotes)  # noqa: S101 - as `__init__` has it
+            placement, votes, _ = surest(self.network, kept)
+            return (placement.rotation @ votes.camera[..., None])[..., 0] + placement.translation
+        sensor = observation.sensor
+        away = -similarity.centre if sensor is None else sensor - similarity.centre
+        return away * similarity.scale[:, None]
+
+    def _searched(self, seen: SeenClouds, mode: Mode) -> tuple[Placement, Float[Tensor, " B"]]:
+        """The best hypothesis after a few steps, and its margin."""
+        refine, views = mode == "refine", seen.views
+        count = self.config.grid_hypotheses if refine else self.config.quick_hypotheses
+        effort = THOROUGH if refine else BRIEF
+        space = self._space()
+        if isinstance(self.network, ViewNetwork) and self._has_learned():
+            said, _, sure = self._voted(seen)
+            start = self._beside(said, views, count)
+            left = successive_halving(self.template, views, start, space, effort)
+            rotation = left.placement.rotation.unflatten(0, left.loss.shape)
+            left = replace(left, unlike=left.unlike + dissent(said, sure, rotation))
+        else:
+            start = self._without_network(views, count)
+            left = successive_halving(self.template, views, start, space, effort)
+        found = left.best(self._limits().wider(CHARGED))
+        final = found.placement
+        if self.config.settle and refine:
+            final = refine_states(self.template, views, found, self._limits())
+        if self.template.deviates():
+            final, _ = refine_deviations(self.template, views, final)
+        return final, found.margin
+
+    def _beside(self, said: Placement, views: PartialViews, count: int) -> Placement:
+        """So many hypotheses of each view: the network's first, the others of the banks."""
+        first = undeviated(said)
+        if count <= 1:
+            return first
+        return interleave([first, self._space().propose(views, count - 1)], len(views.points))
+
+    def _without_network(self, views: PartialViews, count: int) -> Placement:
+        """Hypotheses of the banks alone, or of the network that needs no camera."""
+        if isinstance(self.network, PointVotes) and not count:
+            return in_principal_frames(self.network, views.points)[0]
+        return self._space().propose(views, max(count, 1))
+
+    def _limits(self) -> JointLimits:
+        """Of the training views that the network learned."""
+        return limits_of(self.pseudo.state[self.pseudo.trust > 0], self.template.kinds)
+
+    def _space(self) -> SearchSpace:
+        """States, shifts, sizes and cameras of the training views that the network learned.
+
+        What is seen of the template from there is drawn once.
+        """
+        shape = [*self.template.state_dict(keep_vars=True).values(), *self.pseudo.buffers()]
+        key = [(id(tensor), tensor._version, tensor.device) for tensor in shape]
+        if self._drawn is None or self._drawn[0] != key:
+            self._drawn = key, self._draw()
+        return self._drawn[1]
+
+    def _draw(self) -> SearchSpace:
+        learned = self.pseudo.trust > 0
+        states = grid_of_states(self._limits().wider(ROOM))
+        placement = take(self.pseudo.placement(), learned)
+        camera = F.normalize(self.pseudo.camera[learned], dim=-1)
+        placed = None
+        if len(self.pseudo.points):
+            shown = ShownPoints(
+                points=self.pseudo.points[learned], normals=self.pseudo.normals[learned]
+            )
+            placed = ViewBank.placed(self.template, shown, placement, camera)
+        modes = modes_of(placement, states)
+        return SearchSpace(
+            rendered=ViewBank.rendered(light(self.template), modes, camera),
+            placed=placed,
+            states=states,
+            scorer=self.orientation,
+        )

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""What the network is shown of clouds, what it is taught of them, and what it says.
+
+Clouds are looked at in frames of their own that turn with them (`see`). The network learns from the
+placements between which `quick` would choose (`candidates`), in views that are rolled about their
+ray and thinned (`taught`), and is asked for a placement (`voted`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from scapo.geometry.points import Similarity, farthest_points, gather, k_nearest, nearest, normalise
+from scapo.geometry.rigid import rotation_angle
+from scapo.records import take
+from scapo.registered.axis_deviation import refine_deviations
+from scapo.registered.decode import nearest_weights
+from scapo.registered.joint_limits import JointLimits
+from scapo.registered.network import PointVotes, Target, random_frames, vote_losses
+from scapo.registered.outliers import replaced
+from scapo.registered.pose_search import BRIEF, LOSS_SHARE, SearchSpace, successive_halving
+from scapo.registered.pseudo_labels import Candidates, PseudoLabels, ViewTargets
+from scapo.registered.template import (
+    ArticulatedTemplate,
+    Placement,
+    oriented,
+    turn_placement,
+)
+from scapo.registered.view_network import (
+    ViewNetwork,
+    ViewTarget,
+    along_rays,
+    placed_by_votes,
+    view_losses,
+)
+from scapo.registered.views import PartialViews
+
+NOISE = 0.003  # Normalised length: standard deviation of the points' noise while a network learns
+SAMPLED = 2  # Times `count` points that are drawn from a cloud, of which the farthest are learned
+THINNED = 0.2  # Share of a cloud's points that the network may not be shown in a step
+DISSENT, OTHER_WAY = 0.15, 0.5
+"""Loss that a hypothesis costs which lies another way than the network says, and from about which
+angle on it does, rad."""
+UNIT = 127  # Of stored normals
+PRICE = 5.0  # Of a unit of loss by which the search prefers another candidate, in the network's
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenClouds:
+    """Clouds as every mode looks at them, normalised, in frames of their own."""
+
+    points: Float[Tensor, "B N 3"]
+    clean: Float[Tensor, "B N 3"]
+    """With inliers in place of the outliers."""
+    views: PartialViews
+    frame: Float[Tensor, "B 3 3"]
+    """own_R_cloud"""
+    similarity: Similarity
+    inlier: Bool[Tensor, "B N"]
+    normals: Float[Tensor, "B N 3"]
+    """Of `clean`, towards the camera."""
+
+    def part_weights(
+        self, template: ArticulatedTemplate, placement: Placement
+    ) -> Float[Tensor, "B N P"]:
+        """Of all points, by a placement of the template."""
+        return nearest_weights(template, self.points, self.normals, placement)
+
+
+@torch.no_grad()
+def candidates(
+    template: ArticulatedTemplate,
+    seen: SeenClouds,
+    space: SearchSpace,
+    limits: JointLimits,
+    hypotheses: int,
+) -> Candidates:
+    """What `quick` would choose between, in each cloud's normalised frame.
+
+    Args:
+        template: Is searched for.
+        seen: The clouds.
+        space: In which.
+        limits: Of states, outside which candidates are charged.
+        hypotheses: With how many the search begins.
+    """
+    count = len(seen.points)
+    start = space.propose(seen.views, hypotheses)
+    left = successive_halving(template, seen.views, start, space, BRIEF)
+    placement, best = left.placement, left.best(limits)
+    penalty = limits.penalty(placement.state.unflatten(0, left.loss.shape))
+    cost = left.loss + left.unlike + penalty
+    rows = torch.arange(cost.numel(), device=cost.device).view_as(cost)
+    if template.deviates():
+        views = take(seen.views, torch.arange(count).repeat_interleave(cost.shape[1]))
+        placement, _ = refine_deviations(template, views, placement)
+    source, label = oriented(seen.points, seen.normals), template.logit.argmax(-1).to(torch.uint8)
+    part = []
+    for row in rows.unbind(1):
+        placed = oriented(*template.place(take(placement, row)))
+        part.append(label[k_nearest(source, placed, 1)[..., 0]])
+    back = seen.frame.mT.repeat_interleave(cost.shape[1], 0)
+    return Candidates(
+        placement=turn_placement(placement, back),
+        part=torch.stack(part, 1),
+        gap=cost - cost.amin(1, keepdim=True),
+        margin=best.margin - LOSS_SHARE * best.loss,
+        inlier=seen.inlier,
+        normals=(UNIT * seen.normals @ seen.frame).round().to(torch.int8),
+    )
+
+
+def taught(
+    network: ViewNetwork,
+    template: ArticulatedTemplate,
+    targets: ViewTargets,
+    clouds: tuple[Float[Tensor, "B N 3"], Int[Tensor, " B"]],
+    count: int,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """Terms of the loss of a step: votes of some points of views, rolled at random and thinned.
+
+    Args:
+        network: Learns.
+        template: Whose placements it learns.
+        targets: Of all clouds that it learns from.
+        clouds: Points in the camera's frame, and which of those clouds they are.
+        count: Points of each that vote.
+        generator: On the device of the clouds.
+    """
+    cloud, row = clouds
+    points, similarity = normalise(replaced(cloud, targets.inlier[row]))
+    camera = -similarity.centre * similarity.scale[:, None]  # the camera is the origin
+    order = torch.randperm(points.shape[1], generator=generator, device=points.device)
+    left_out = THINNED * torch.rand((), generator=generator, device=points.device)
+    shown = order[: int(len(order) * (1 - left_out))]
+    asked = shown[:count]
+    turn = along_rays(camera, generator)
+    part = targets.part[row].long()
+    placement = targets.placement(row)
+    placement = turn_placement(placement, turn.repeat_interleave(part.shape[1], 0))
+    with torch.no_grad():
+        poses = template.part_poses(placement)
+    target = ViewTarget(
+        poses=poses,
+        part=part[..., asked],
+        log_scale=targets.log_scale[row],
+        shift=targets.shift[row],
+        deviation=targets.deviation[row],
+        price=PRICE * targets.gap[row],
+        trust=targets.trust[row],
+    )
+    noise = torch.randn(points.shape, generator=generator, device=points.device)
+    points = points @ turn.mT + NOISE * noise
+    normals = targets.normals[row].to(points) / UNIT @ turn.mT
+    votes = network(points[:, shown], normals[:, shown], len(asked))
+    return view_losses(votes, points[:, asked], target)
+
+
+def taught_in_principal_frames(
+    network: PointVotes,
+    template: ArticulatedTemplate,
+    pseudo: PseudoLabels,
+    clouds: tuple[Float[Tensor, "B N 3"], Int[Tensor, " B"]],
+    count: int,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """The same for the network that is asked where nobody knows the camera.
+
+    Args:
+        network: Learns.
+        template: Whose placements it learns.
+        pseudo: Those of all clouds that it learns from.
+        clouds: Points in the camera's frame, and which of those clouds they are.
+        count: Points of each that vote.
+        generator: On the device of the clouds.
+    """
+    cloud, row = clouds
+    points, _ = normalise(replaced(cloud, pseudo.belonging[row]))
+    index = torch.randperm(points.shape[1], generator=generator, device=points.device)
+    points = points[:, index[: SAMPLED * count]]
+    points = gather(points, farthest_points(points, min(count, points.shape[1])))
+    frame = random_frames(points, generator)
+    noise = torch.randn(points.shape, generator=generator, device=points.device) * NOISE
+    with torch.no_grad():
+        placement = take(pseudo.placement(), row)
+        placed, _ = template.place(placement)
+        target = Target(
+            points=(points - placement.translation[:, None]) @ placement.rotation,
+            part=template.logit.softmax(-1)[nearest(points, placed)],
+            state=placement.state,
+            log_scale=placement.log_scale,
+            shift=placement.shift,
+            camera=pseudo.camera[row],
+            trust=pseudo.trust[row],
+        )
+    return vote_losses(network((points + noise) @ frame.mT), target)
+
+
+@torch.no_grad()
+def voted(
+    network: ViewNetwork, template: ArticulatedTemplate, seen: SeenClouds
+) -> tuple[Placement, Float[Tensor, "B N P"], Float[Tensor, " B"]]:
+    """What the network says: placement in the clouds' frames, part weights, how sure it is."""
+    turn = seen.views.look
+    points = seen.clean @ turn.mT
+    votes = network(points, seen.normals @ turn.mT, points.shape[1])
+    placement, sure = placed_by_votes(votes, points, template)
+    return turn_placement(placement, turn.mT), votes.part.softmax(-1), sure
+
+
+def undeviated(placement: Placement) -> Placement:
+    """About the category's axes, as a search begins."""
+    return replace(placement, deviation=torch.zeros_like(placement.deviation))
+
+
+def dissent(
+    said: Placement, sure: Float[Tensor, " B"], rotation: Float[Tensor, "B F 3 3"]
+) -> Float[Tensor, "B F"]:
+    """What hypotheses cost that lie another way than the network says, by how sure it is.
+
+    Args:
+        said: The network's placement.
+        sure: 1 where its votes agree, to 0.
+        rotation: view_R_template of F hypotheses of each.
+    """
+    apart = rotation_angle(rotation, said.rotation[:, None].expand_as(rotation))
+    return DISSENT * sure[:, None] * (1 - torch.exp(-(apart / OTHER_WAY).square()))
