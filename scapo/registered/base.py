@@ -49,6 +49,7 @@ from scapo.registered.pose_search import (
     BRIEF,
     CHARGED,
     THOROUGH,
+    Hypotheses,
     SearchResult,
     SearchSpace,
     grid_of_states,
@@ -364,33 +365,31 @@ class AbstractRegistered(AbstractMethod):
 
     def _searched(self, seen: SeenClouds, mode: Mode) -> tuple[Placement, Float[Tensor, " B"]]:
         """The best hypothesis after a few steps, and its margin."""
-        refine, views = mode == "refine", seen.views
-        count = self.config.grid_hypotheses if refine else self.config.quick_hypotheses
-        effort = THOROUGH if refine else BRIEF
-        space = self._space()
-        if isinstance(self.network, ViewNetwork) and self._has_learned():
-            said, _, sure = self._voted(seen)
-            start = self._beside(said, views, count)
-            left = successive_halving(self.template, views, start, space, effort)
-            rotation = left.placement.rotation.unflatten(0, left.loss.shape)
-            left = replace(left, unlike=left.unlike + dissent(said, sure, rotation))
-        else:
-            start = self._without_network(views, count)
-            left = successive_halving(self.template, views, start, space, effort)
+        left = self._hypotheses(seen, mode == "refine")
         found = left.best(self._limits().wider(CHARGED))
         final = found.placement
-        if self.config.settle and refine:
-            final = refine_states(self.template, views, found, self._limits())
+        if self.config.settle and mode == "refine":
+            final = refine_states(self.template, seen.views, found, self._limits())
         if self.template.deviates():
-            final, _ = refine_deviations(self.template, views, final)
+            final, _ = refine_deviations(self.template, seen.views, final)
         return final, found.margin
 
-    def _beside(self, said: Placement, views: PartialViews, count: int) -> Placement:
-        """So many hypotheses of each view: the network's first, the others of the banks."""
-        first = undeviated(said)
-        if count <= 1:
-            return first
-        return interleave([first, self._space().propose(views, count - 1)], len(views.points))
+    def _hypotheses(self, seen: SeenClouds, refine: bool) -> Hypotheses:
+        """Those that are left in the end, charged where the network says otherwise."""
+        config, views, space = self.config, seen.views, self._space()
+        effort = THOROUGH if refine else BRIEF
+        if isinstance(self.network, PointVotes) or not self._has_learned():
+            count = config.grid_hypotheses if refine else config.quick_hypotheses
+            start = self._without_network(views, count)
+            return successive_halving(self.template, views, start, space, effort)
+        said, _, sure = self._voted(seen)
+        beside = config.grid_hypotheses if refine else config.quick_beside
+        start = undeviated(said)
+        if beside:
+            start = interleave([start, space.propose(views, beside)], len(views.points))
+        left = successive_halving(self.template, views, start, space, effort)
+        charge = dissent(self.template, said, sure, left.placement)
+        return replace(left, unlike=left.unlike + charge)
 
     def _without_network(self, views: PartialViews, count: int) -> Placement:
         """Hypotheses of the banks alone, or of the network that needs no camera."""

@@ -115,11 +115,15 @@ class SearchConfig:
     """Of the layers of the network that is asked where nobody knows the camera."""
     points: int = 256
     """Points of each cloud that the network and the search see."""
-    grid_hypotheses: int = 32
-    """Placements of each cloud that `refine` begins with: half of them as of clouds that look alike
-    and were placed in training, half as of images of the template; 0: the network's four."""
+    grid_hypotheses: int = 16
+    """Placements of each cloud that `refine` begins with beside the network's: half of them as of
+    clouds that look alike and were placed in training, half as of images of the template. 0: the
+    network's alone."""
+    quick_beside: int = 0
+    """Of these, those with which `quick` begins beside the network's, of 32 that stand as objects
+    do."""
     quick_hypotheses: int = 6
-    """Placements of each cloud that `quick` begins with, of 32 those that stand as objects do."""
+    """Such placements with which the search begins before there is a network."""
     strays: Literal["out", "kept"] = "out"
     """Whether outliers, points that do not belong to the object, are left out."""
     settle: bool = True

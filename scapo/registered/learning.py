@@ -42,9 +42,9 @@ from scapo.registered.views import PartialViews
 NOISE = 0.003  # Normalised length: standard deviation of the points' noise while a network learns
 SAMPLED = 2  # Times `count` points that are drawn from a cloud, of which the farthest are learned
 THINNED = 0.2  # Share of a cloud's points that the network may not be shown in a step
-DISSENT, OTHER_WAY = 0.15, 0.5
-"""Loss that a hypothesis costs which lies another way than the network says, and from about which
-angle on it does, rad."""
+DISSENT, OTHER_WAY = 0.2, 0.4
+"""Loss that a part costs which a hypothesis turns another way than the network says, and from about
+which angle on it does, rad."""
 UNIT = 127  # Of stored normals
 PRICE = 5.0  # Of a unit of loss by which the search prefers another candidate, in the network's
 
@@ -219,14 +219,20 @@ def undeviated(placement: Placement) -> Placement:
 
 
 def dissent(
-    said: Placement, sure: Float[Tensor, " B"], rotation: Float[Tensor, "B F 3 3"]
+    template: ArticulatedTemplate,
+    said: Placement,
+    sure: Float[Tensor, " B"],
+    hypotheses: Placement,
 ) -> Float[Tensor, "B F"]:
-    """What hypotheses cost that lie another way than the network says, by how sure it is.
+    """What hypotheses cost whose parts lie another way than the network says, by how sure it is.
 
     Args:
-        said: The network's placement.
+        template: Whose parts they are.
+        said: The network's placement of B views.
         sure: 1 where its votes agree, to 0.
-        rotation: view_R_template of F hypotheses of each.
+        hypotheses: F of each, those of a view in a row.
     """
-    apart = rotation_angle(rotation, said.rotation[:, None].expand_as(rotation))
-    return DISSENT * sure[:, None] * (1 - torch.exp(-(apart / OTHER_WAY).square()))
+    own = template.part_poses(said).rotation[:, None]  # (B, 1, P, 3, 3)
+    other = template.part_poses(hypotheses).rotation.unflatten(0, (len(sure), -1))
+    apart = rotation_angle(other, own.expand_as(other))
+    return sure[:, None] * (DISSENT * (1 - torch.exp(-(apart / OTHER_WAY).square()))).sum(-1)

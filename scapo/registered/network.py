@@ -11,12 +11,11 @@ adjustment found. It is asked where nobody knows the camera; elsewhere `view_net
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import ClassVar
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from scapo.geometry.points import MEAN_RADIUS, gather, k_nearest
@@ -76,10 +75,7 @@ class PointVotes(nn.Module):
 
     def forward(self, points: Float[Tensor, "B K 3"]) -> Votes:
         """Votes for clouds of mean radius 0.25 in their principal frames."""
-        return self.given(points, k_nearest(points, points, NEIGHBOURS))
-
-    def given(self, points: Float[Tensor, "B K 3"], index: Int[Tensor, "B K N"]) -> Votes:
-        """The same with the nearest points of each known."""
+        index = k_nearest(points, points, NEIGHBOURS)
         near = gather(points, index.flatten(1)).unflatten(1, index.shape[1:])
         step = STEP_SCALE * (near - points[:, :, None])
         here = (POINT_SCALE * points)[:, :, None].expand_as(step)
@@ -100,26 +96,6 @@ class PointVotes(nn.Module):
             shift=whole[:, j + 3 : 4 * j + 3].unflatten(1, (j, 3)),
             camera=CAMERA_UNIT * whole[:, 4 * j + 3 :],
         )
-
-
-class PlainVotes(nn.Module):
-    """The network in operations that other runtimes have (`scapo.export.network`).
-
-    Neighbours are found by all distances, where `PointVotes` asks numpy on a CPU.
-    """
-
-    OUTPUTS: ClassVar = tuple(item.name for item in fields(Votes))
-
-    def __init__(self, network: PointVotes) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, points: Float[Tensor, "B K 3"]) -> tuple[Tensor, ...]:
-        """The fields of `Votes` in their order."""
-        away = points[:, :, None] - points[:, None]
-        index = away.square().sum(-1).topk(NEIGHBOURS, largest=False).indices
-        votes = self.network.given(points, index)
-        return tuple(getattr(votes, name) for name in self.OUTPUTS)
 
 
 def _block(inputs: int, outputs: int) -> nn.Sequential:

@@ -16,8 +16,8 @@ common decides which way an object of two like halves lies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -91,7 +91,7 @@ def image_of(
     ones = torch.ones_like(points[..., :1])
     each = torch.cat([ones, POINT_SCALE * points[..., 2:], normals, place - cell - 0.5], -1)
     index = (cell[..., 1:] * CELLS + cell[..., :1]).long().expand(-1, -1, each.shape[-1])
-    total = points.new_zeros(len(points), CELLS**2, each.shape[-1]).scatter_add(1, index, each)
+    total = points.new_zeros(points.shape[0], CELLS**2, each.shape[-1]).scatter_add(1, index, each)
     count = total[..., :1]
     shown = total[..., 1:] / count.clamp_min(1)
     image = torch.cat([(count > 0).to(points), shown, count.clamp_max(2 * FULL) / FULL], -1)
@@ -192,6 +192,25 @@ class ViewNetwork(nn.Module):
             own = self.state_dict()
             state_dict.update({prefix + name: value for name, value in own.items()})
         super()._load_from_state_dict(state_dict, prefix, *rest, **named)
+
+
+class PlainViewVotes(nn.Module):
+    """The network with one tensor in and plain tensors out, for other runtimes (`scapo.export`)."""
+
+    OUTPUTS: ClassVar = tuple(item.name for item in fields(ViewVotes))
+
+    def __init__(self, network: ViewNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, cloud: Float[Tensor, "B K 6"]) -> tuple[Tensor, ...]:
+        """The fields of `ViewVotes` in their order, of all points.
+
+        Args:
+            cloud: Points with the ray along z, and their normals.
+        """
+        votes = self.network(cloud[..., :3], cloud[..., 3:], cloud.shape[1])
+        return tuple(getattr(votes, name) for name in self.OUTPUTS)
 
 
 def _sampled(

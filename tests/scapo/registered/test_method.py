@@ -14,6 +14,7 @@ from scapo.categories import CATEGORIES
 from scapo.geometry.points import squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Mode, Step
+from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.decode import nearest_weights
 from scapo.registered.method import TemplateRegistration
@@ -32,7 +33,7 @@ def at(progress: float, index: Tensor, g: torch.Generator) -> Step:
     return Step(stage="votes", progress=progress, generator=g, index=index, total=12)
 
 
-def known(method: TemplateRegistration, views: PartialViews, truth: Placement) -> Candidates:
+def known(method: AbstractRegistered, views: PartialViews, truth: Placement) -> Candidates:
     """The true placements as the only candidates."""
     part = nearest_weights(method.template, views.points, views.normals, truth).argmax(-1)
     count = len(views.points)
@@ -116,12 +117,14 @@ def test_refinement_brings_the_template_closer(steps: int, count: int):
     assert torch.allclose(refined.part_weight.sum(-1), torch.tensor(1.0), atol=1e-4)
 
 
-def test_quick_and_refine_find_the_poses_whatever_the_network_says():
+def test_quick_finds_the_poses_without_a_network_and_refine_whatever_it_says():
     method, observation = trained(0)
+    assert isinstance(method.network, ViewNetwork)
     views, truth = sighted(6, seed=61)
     unseen = Observation(points=views.points - views.camera[:, None])
     bounds: tuple[tuple[Mode, float], ...] = (("quick", 8), ("refine", 6))
     for mode, apart in bounds:
+        method.network.learned.fill_(float(mode == "refine"))
         found = method.predict(unseen, mode)
         assert found.camera_T_part is not None
         errors = rotation_angle(found.camera_T_part[:, 0, :3, :3], truth.rotation).rad2deg()
