@@ -81,3 +81,13 @@ def test_a_search_begins_about_the_axes_of_the_category() -> None:
     plain = undeviated(truth)
     assert plain.deviation.abs().max() == 0
     assert_close(plain.rotation, truth.rotation)
+
+
+def test_deviations_are_told_of_the_best_candidate_alone() -> None:
+    method, _ = trained(0)
+    method.template.load.fill_(0.1)
+    method.template.noise.copy_(1e-4 * torch.eye(len(method.template.noise)))
+    views, _ = sighted(3, seed=61)
+    found = method._candidates(views.points - views.camera[:, None])
+    told = found.placement.deviation.flatten(1).abs().amax(1).view_as(found.gap) > 0
+    assert torch.equal(told, found.gap == 0)
