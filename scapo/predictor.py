@@ -70,9 +70,9 @@ class Predictor:
         Args:
             points: (..., N, 3), camera frame, metres, numpy or torch.
             mode: `fast`, networks only, `quick` or `refine`; by default the method's own choice,
-                `quick` for template registration, whose network alone says little.
+                `quick` for template registration.
             sensor: (..., 3), centre of the camera, metres, for clouds in another frame than the
-                camera's. What `refine` of a `registered` model uses.
+                camera's. What a `registered` model uses.
             color: (..., N, 3), in [0, 1], for methods that look at it.
             own_frame: Answer in the method's own frames, order of parts and states.
 

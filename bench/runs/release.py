@@ -50,7 +50,7 @@ LEGEND = (
     "and t in units of 4 x the cloud's mean radius."
 )
 CAMERA = """
-`quick` and `refine` use where the camera stands: the origin of the cloud's frame, or `sensor`."""
+It uses where the camera stands: the origin of the cloud's frame, or `sensor`."""
 CARD = """# {title}: {category}
 
 `scapo.load("{name}").predict(points)`: parts, poses and joints of one {category} in a

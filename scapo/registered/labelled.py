@@ -5,8 +5,8 @@ What one template per category can explain at best limits the registration metho
 discovery gets wrong. Here nothing is discovered. True part poses bring the points of the training
 clouds to rest, in their object's frame; each object is scaled along that frame's axes until its box
 at rest is the template's; where a sliding part sits on the body is taken out too. There the points
-that most clouds share make the template, their parts and joints as labelled. The network learns the
-true placements; network, search and refinement are those of `registered`. Axes do not deviate.
+that most clouds share make the template, their parts and joints as labelled. Network, search and
+refinement are those of `registered`; the network learns what the search finds. Axes do not deviate.
 
 As poses were seen in training, predicted part frames are the true ones: those of the object at
 rest.
@@ -64,8 +64,8 @@ class LabelledConfig(SearchConfig):
     """A bound: template registration with the template of true placements, all labels."""
 
     trusted: float = 1.0
-    """Share of the learned clouds, those that the template explains best, that the network learns
-    from; their placements are all true."""
+    """Share of the learned clouds, those that the template explains best, that tell states, cameras
+    and looks, all true, and of the placed ones from which the network learns."""
 
 
 class LabelledRegistered(AbstractRegistered):

@@ -37,7 +37,7 @@ from scapo.registered.view_network import (
     placed_by_votes,
     view_losses,
 )
-from scapo.registered.views import PartialViews
+from scapo.registered.views import PartialViews, surface_normals
 
 NOISE = 0.003  # Normalised length: standard deviation of the points' noise while a network learns
 SAMPLED = 2  # Times `count` points that are drawn from a cloud, of which the farthest are learned
@@ -68,7 +68,10 @@ class SeenClouds:
         self, template: ArticulatedTemplate, placement: Placement
     ) -> Float[Tensor, "B N P"]:
         """Of all points, by a placement of the template."""
-        return nearest_weights(template, self.points, self.normals, placement)
+        normals = self.normals
+        if not bool(self.inlier.all()):  # outliers have normals of their own
+            normals = surface_normals(self.points, self.points, self.views.camera)
+        return nearest_weights(template, self.points, normals, placement)
 
 
 @torch.no_grad()
