@@ -106,7 +106,8 @@ def main(run: Path, data: Path, count: int, picture: Path | None) -> None:
     found, _ = predicted(method, train, "refine")
     offsets = fit_calibration(poses(found), poses(known), scale=lengths(train))
     for name, mode, number in [*modes, ("`refine`", "refine", 0)]:
-        method.config = replace(method.config, quick_hypotheses=max(number, 1))
+        beside = max(number, 1) - 1
+        method.config = replace(method.config, quick_hypotheses=beside + 1, quick_beside=beside)
         answer, spent = predicted(method, val, mode)
         wrong = errors(category, answer, truth, offsets, lengths(val))
         base, turned = wrong["part_rotation"][:, 0], wrong["part_rotation"]

@@ -20,16 +20,14 @@ import torch.nn.functional as F
 
 import scapo
 from scapo import store
-from scapo.geometry.points import normalise
 from scapo.geometry.rigid import axis_angle
 from scapo.method import evenly
 from scapo.records import take
 from scapo.registered.bundle_adjustment import bundle_adjust, late_options
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.motion_segmentation import rebuild
-from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.template import ArticulatedTemplate, Placement
-from scapo.registered.views import observe
+from scapo.types import Observation
 
 SURE = 0.3  # Quantile of the confidences below which clouds are left out
 SAME = 0.9  # Cosine to the template's axis below which a cloud is misplaced and says nothing
@@ -60,11 +58,10 @@ def main(run: Path, data: str, category: str, clouds: int, rounds: int, seed: in
     some = [split[int(k)] for k in evenly(len(split), clouds)]
     cloud = torch.stack([torch.as_tensor(one["points"]) for one in some]).float()
     axes = torch.stack([torch.as_tensor(one["joint_axis"]) for one in some]).float()
-    points, similarity = normalise(replaced(cloud, inlier_mask(cloud)))
-    camera = -similarity.centre * similarity.scale[:, None]
-    views = observe(points, camera, count=method.config.points)
     with torch.no_grad():
-        placement, confidence = method._searched(views, "refine")
+        seen = method._seen(Observation(points=cloud))
+        placement, confidence = method._searched(seen, "refine")
+    views, axes = seen.views, axes @ seen.frame.mT  # in the clouds' own frames
     template, config = method.template, method.config.discovery
     tell("as trained", template, placement, axes)
     sure = (confidence > confidence.quantile(SURE)).nonzero()[:, 0]
