@@ -6,9 +6,9 @@ What `method` and its bound (`labelled`) share: all but where the template comes
 
 from __future__ import annotations
 
-import logging
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -71,12 +71,9 @@ from scapo.registered.view_network import ViewNetwork
 from scapo.registered.views import NEIGHBOURS, PartialViews, observe, surface_normals
 from scapo.types import Labels, Observation, Prediction
 
-logger = logging.getLogger(__name__)
-
 LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
-SAMPLED = 2  # Times `points` that are drawn from a cloud, of which the farthest are learned from
 LAST_RATE = 0.01  # Share of the learning rate at the end
-PLACED = 50  # Clouds that are placed at a time
+PLACED, KEPT = 50, 500  # Clouds that are placed at a time, and after which what was found is kept
 PLACING, LATE = 0.08, 0.8
 """Seconds of one core for each of them, and the share of the start that is over before."""
 ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
@@ -162,7 +159,7 @@ class AbstractRegistered(AbstractMethod):
         self._set_pseudo_labels(cloud[:, 0], views, made.found)
         self.pseudo.belonging = inlier
         self._learn_orientation(views, made, seed)
-        self.network.cpu()
+        self.cpu()
         self._place(observation.points, generator)
         self.to(device)
 
@@ -171,19 +168,24 @@ class AbstractRegistered(AbstractMethod):
         if not isinstance(self.network, ViewNetwork):
             return
         index = evenly(len(cloud), self.config.placed).to(cloud.device)
-        self.journal.tell(f"placing {len(index)} clouds", LATE, PLACING * len(index))
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
-        found = self.journal.once(
-            "placed clouds",
-            lambda: cat([self._candidates(some) for some in cloud[index].cpu().split(PLACED)]),
-            host,
-            {kind.__name__: kind for kind in (Candidates, Placement)},
-        )
+        makers = {kind.__name__: kind for kind in (Candidates, Placement)}
+        parts, total = list[Candidates](), len(index)
+        for number, some in enumerate(cloud[index].cpu().split(KEPT)):
+            done = number * KEPT
+            share = LATE + (1 - LATE) * done / total
+            self.journal.tell(f"placing clouds, {done} of {total}", share, PLACING * (total - done))
+            make = partial(self._candidates_of_all, some)
+            parts.append(self.journal.once(f"placed clouds from {done} on", make, host, makers))
+        found = cat(parts)
         trust = torch.zeros_like(found.margin)
         count = max(1, round(self.config.trusted * len(trust)))
         trust[found.margin.topk(count).indices] = 1.0
         self.targets.set(found, trust)
         self.network.learned.fill_(1.0)
+
+    def _candidates_of_all(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
+        return cat([self._candidates(some) for some in cloud.split(PLACED)])
 
     def _candidates(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
         limits = self._limits().wider(CHARGED)
@@ -261,13 +263,11 @@ class AbstractRegistered(AbstractMethod):
         self.targets.clear()
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
-        """The network's votes against the placements that were found (`vote_losses`)."""
+        """The network's votes against the placements that were found (`learning`)."""
         del labels
-        row = self._learned_row(step)
+        clouds, count = (observation.points, self._learned_row(step)), self.config.points
         if isinstance(self.network, ViewNetwork):
-            clouds, count = (observation.points, row), self.config.points
             return taught(self.network, self.template, self.targets, clouds, count, step.generator)
-        clouds, count = (observation.points, row), self.config.points
         return taught_in_principal_frames(
             self.network, self.template, self.pseudo, clouds, count, step.generator
         )

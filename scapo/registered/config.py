@@ -160,7 +160,7 @@ def quick_config() -> RegisteredConfig:
         further_objects=8, further_views=8, contenders=1, heats=(), judged=16, mirror=False,
         halves=False, leans=False, final_points=800, dense_rounds=1,
     )  # fmt: skip
-    return RegisteredConfig(preset="quick", discovery=discovery, learned=120, placed=600, epochs=10)
+    return RegisteredConfig(preset="quick", discovery=discovery, learned=120, placed=240, epochs=10)
 
 
 PRESETS = {"cpu": cpu_config, "quick": quick_config}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """What the network is shown of clouds, what it is taught of them, and what it says.
 
-Clouds are looked at in frames of their own that turn with them (`see`). The network learns from the
-placements between which `quick` would choose (`candidates`), in views that are rolled about their
-ray and thinned (`taught`), and is asked for a placement (`voted`).
+Clouds are looked at in frames of their own that turn with them (`SeenClouds`). The network learns
+from the placements between which `quick` would choose (`candidates`), in views that are rolled
+about their ray and thinned (`taught`), and is asked for a placement (`voted`).
 """
 
 from __future__ import annotations

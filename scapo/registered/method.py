@@ -12,11 +12,11 @@ positions of the training clouds are known (their frame's origin).
 
 The network proposes how the template stands in a cloud, two banks of images (`view_bank`) propose
 more, which a scorer sorts that learned what standing objects look like (`orientation`). `fast` is
-the network's word. `quick` and `refine` fit the template to the cloud: `quick` from a few proposals
-in a few steps, `refine` from more of them to the end. All ask where the camera was: at the origin
-of the cloud's frame or at `Observation.sensor`. Where that is not known (`camera="estimated"`)
-another network (`network`) is asked in four frames that the points alone tell, and where it
-believes the camera is there `quick` and `refine` take it to be.
+the network's word. `quick` and `refine` fit the template to the cloud: `quick` from that word in a
+few steps, `refine` from it and the banks' proposals to the end. All ask where the camera was: at
+the origin of the cloud's frame or at `Observation.sensor`. Where that is not known
+(`camera="estimated"`) another network (`network`) is asked in four frames that the points alone
+tell, and where it believes the camera is there `quick` and `refine` take it to be.
 """
 
 from __future__ import annotations
@@ -38,9 +38,7 @@ from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.objects import ObjectViews, grouped
-from scapo.registered.template import (
-    Placement,
-)
+from scapo.registered.template import Placement
 from scapo.registered.views import PartialViews
 from scapo.store.checkpoint import (
     check_header,
@@ -71,7 +69,12 @@ class TemplateRegistration(AbstractRegistered):
     def start(
         self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
     ) -> None:
-        """As another run found it, where one is named; else found here."""
+        """As another run found it, where one is named; else found here.
+
+        Raises:
+            ValueError: A run that was told more, or whose template has another size.
+            StoreError: No such run (`load_run`).
+        """
         if self.config.start is None:
             super().start(stage, observation, labels, generator)
             return
@@ -80,6 +83,12 @@ class TemplateRegistration(AbstractRegistered):
             raise ValueError(
                 f"start: {self.config.start} was told {', '.join(left)}; "
                 f"add --supervision {' '.join(left)}"
+            )
+        if len(known.template.points) != len(self.template.points):
+            raise ValueError(
+                f"start: expected a template of {len(self.template.points)} points, found one of "
+                f"{len(known.template.points)} in {self.config.start}; "
+                f"add --discovery.final-points {len(known.template.points)}"
             )
         device = self.template.points.device
         for name in ("template", "pseudo", "orientation"):

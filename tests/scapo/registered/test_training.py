@@ -150,3 +150,29 @@ def test_too_few_clouds_are_refused() -> None:
     made = method(replace(CONFIG, learned=7))
     with pytest.raises(ValueError, match="training data: expected at least 8 clouds, found 5"):
         made.start("votes", clouds(5), Labels(), torch.Generator().manual_seed(0))
+
+
+def test_a_run_begins_at_another_ones_template_and_refuses_what_does_not_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, truth = sighted(10, seed=80)
+    none = torch.zeros(10)
+    found = SearchResult(placement=truth, loss=none, margin=none)
+    made = Discovery(template=template(count=240), found=found, scorer=OrientationScorer())
+    monkeypatch.setattr(room, "discover", lambda *_: made)
+    data = TrainingData(observation=clouds(10), labels=Labels(), digest="here")
+    told = replace(CONFIG, learned=10, placed=10, epochs=1, supervision=("instance",))
+    fit.fit(method(told), data, tmp_path / "first", RUN)
+
+    monkeypatch.setattr(room, "discover", None)  # it is not found again
+    begun = replace(told, start=str(tmp_path / "first"))
+    fit.fit(method(begun), data, tmp_path / "second", RUN)
+    second = load(tmp_path / "second").model
+    assert isinstance(second, TemplateRegistration)
+    assert torch.equal(second.template.points, made.template.points)
+    g = torch.Generator()
+    with pytest.raises(ValueError, match="was told instance; add --supervision instance"):
+        method(replace(begun, supervision=())).start("votes", clouds(10), Labels(), g)
+    larger = replace(begun, discovery=replace(DISCOVERY, final_points=300))
+    with pytest.raises(ValueError, match=r"found one of 240 .* add --discovery\.final-points 240"):
+        method(larger).start("votes", clouds(10), Labels(), g)
