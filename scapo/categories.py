@@ -19,6 +19,7 @@ from scapo.text import did_you_mean, is_word
 
 JointKind = Literal["revolute", "prismatic"]
 RestRule = Literal["smallest-box", "largest-box", "tallest"]
+HingeRule = Literal["any", "upright"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +66,8 @@ class Category:
     """Rotation A of the object frame that exchanges the parts (docs/data-format.md), or None."""
     rest: RestRule = "smallest-box"
     """Which joint limit is rest, for models that do not say: the one with this bounding box."""
+    hinge: HingeRule = "any"
+    """Whether all hinges stand: tells what is up in models that have it by convention alone."""
     words: tuple[str, ...] = ()
     """Link or semantic names that tell the moving parts of this category."""
 
@@ -167,6 +170,7 @@ _ALL = (
         window=_CABINET,
         diagonal=0.65,
         rest="smallest-box",
+        hinge="upright",
         words=("door",),
     ),
     Category(

@@ -14,8 +14,9 @@ goes before, unless a door or drawer plainly (within 26 degrees) opens another w
   +x, the rings towards the user; the first blade is the one from which the other opens by a turn
   about -z, so that when they open the first tip is at +y.
 
-What is up is the caller's, else the source's. A URDF of no known set has z up by REP 103, but a
-safe whose hinge runs along y has y up, as in glTF: safes' hinges stand.
+What is up is the caller's, else the source's. A URDF of no known set has z up by REP 103, but
+where a category's hinges stand (safes, `Category.hinge`) and a model's runs along y, y is up, as
+in glTF.
 
 Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
 Left of eyeglasses is the wearer's, who looks out of the front: -y. Left of a basket is that of
@@ -100,12 +101,12 @@ def told_up(category: Category, up: Vector, axis: Float[np.ndarray, "J 3"]) -> V
     """What is up in a model whose source has it by convention alone, by the rule above.
 
     Args:
-        category: Safes alone tell it.
+        category: Those whose hinges stand tell it.
         up: By the convention; unit, root link.
         axis: Unit, root link.
     """
     other = np.eye(3)[1]
-    return other if category.name == "safe" and abs(axis[0] @ other) > SURE else up
+    return other if category.hinge == "upright" and abs(axis[0] @ other) > SURE else up
 
 
 def snapped(vector: Vector, up: Vector) -> Vector:
