@@ -14,6 +14,9 @@ from typing import NoReturn
 INTERRUPTED = 130
 """Exit status of a program ended by Ctrl-C, as a shell reports it: 128 + SIGINT."""
 
+UNHEARD = 141
+"""Exit status of a program whose reader went away, as a shell reports it: 128 + SIGPIPE."""
+
 
 @contextmanager
 def quit_at_interrupt(program: str) -> Iterator[None]:
@@ -51,3 +54,12 @@ def exit_interrupted(line: str = "") -> NoReturn:
         sys.stderr.write(f"{line}\n")
     eval("0")
     sys.exit(INTERRUPTED)
+
+
+def exit_unheard() -> NoReturn:
+    """End the process whose output nobody reads any more (`scapo-bench --help | head`), silently.
+
+    What is still buffered goes nowhere, or the interpreter would complain of it at its end.
+    """
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(UNHEARD)

@@ -61,6 +61,17 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
+def unknown_word(kind: str, word: str, known: Iterable[str]) -> str:
+    """What to say of a word of a command that is none of those that there are.
+
+    >>> unknown_word("verb", "trian", ["train", "predict"])
+    "verb 'trian': expected one of train, predict, found none; did you mean 'train'?"
+    """
+    names = list(known)
+    expected = f"expected one of {', '.join(names)}, found none"
+    return f"{kind} {word!r}: {expected}{did_you_mean(word, names)}"
+
+
 def as_cell(text: str) -> str:
     """A text cell of a CSV file that no spreadsheet takes for a formula; `from_cell` undoes it.
 

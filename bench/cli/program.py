@@ -16,8 +16,8 @@ from rich.logging import RichHandler
 from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
 from bench.requests import UsageError
-from scapo.interrupt import exit_interrupted
-from scapo.text import did_you_mean
+from scapo.interrupt import exit_interrupted, exit_unheard
+from scapo.text import unknown_word
 
 DESCRIPTION = (
     "Train, predict, score and tabulate methods of articulated pose estimation "
@@ -46,8 +46,7 @@ def _check_names(words: Sequence[str]) -> None:
         kinds.append(("method", all_methods()))
     for word, (kind, known) in zip(words, kinds, strict=False):
         if not word.startswith("-") and word.replace("_", "-") not in known:
-            found = f"expected one of {', '.join(known)}, found none"
-            raise UsageError(f"{kind} {word!r}: {found}{did_you_mean(word, known)}")
+            raise UsageError(unknown_word(kind, word, known))
 
 
 def run(arguments: Sequence[str] | None = None) -> None:
@@ -76,6 +75,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except MemoryError as error:
         say(errors, f"scapo-bench: expected enough memory, found: {error}")
         sys.exit(1)
+    except BrokenPipeError:
+        exit_unheard()
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         say(errors, f"scapo-bench: {error}")
         sys.exit(2 if isinstance(error, UsageError) else 1)

@@ -12,8 +12,8 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from scapo.interrupt import exit_interrupted
-from scapo.text import one_line
+from scapo.interrupt import exit_interrupted, exit_unheard
+from scapo.text import one_line, unknown_word
 from sim_assets.cli.verbs import VERBS, UsageError
 
 DESCRIPTION = (
@@ -34,6 +34,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
         _say(console, f"scapo-data {version('scapo')}")
         sys.exit(0)
     try:
+        if words and not words[0].startswith("-") and words[0] not in VERBS:
+            raise UsageError(unknown_word("verb", words[0], VERBS))
         command: Any = tyro.cli(
             _commands(),
             prog="scapo-data",
@@ -45,6 +47,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except MemoryError as error:
         _say(errors, f"scapo-data: expected enough memory, found: {error}")
         sys.exit(1)
+    except BrokenPipeError:
+        exit_unheard()
     except (ValueError, OSError, RuntimeError) as error:
         _say(errors, f"scapo-data: {error}")
         sys.exit(2 if isinstance(error, UsageError) else 1)

@@ -45,3 +45,16 @@ def test_a_program_may_begin_in_another_thread() -> None:
 
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(begin).result() == "begun"
+
+
+@pytest.mark.parametrize("program", ["scapo-bench", "scapo-data"])
+def test_a_reader_that_goes_away_is_no_error(program: str) -> None:
+    """`scapo-bench --help | head -1`."""
+    command = [Path(sys.executable).parent / program, "--help"]
+    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipe) as running:
+        assert running.stdout
+        assert running.stderr
+        running.stdout.close()
+        assert running.stderr.read() == ""
+    assert running.returncode == 141
