@@ -49,6 +49,7 @@ from scapo.registered.pose_search import (
     BRIEF,
     CHARGED,
     THOROUGH,
+    Effort,
     Hypotheses,
     SearchResult,
     SearchSpace,
@@ -72,6 +73,7 @@ from scapo.registered.views import NEIGHBOURS, PartialViews, observe, surface_no
 from scapo.types import Labels, Observation, Prediction
 
 LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
+FIRST = "votes"  # Stage of the network's first round
 LAST_RATE = 0.01  # Share of the learning rate at the end
 PLACED, KEPT = 50, 500  # Clouds that are placed at a time, and after which what was found is kept
 PLACING, LATE = 0.08, 0.8
@@ -120,17 +122,20 @@ class AbstractRegistered(AbstractMethod):
         self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None
 
     def stages(self) -> tuple[Stage, ...]:
-        """The network's; the template is found before it starts."""
-        stage = Stage(
-            name="votes",
-            epochs=self.config.epochs,
-            lr=self.config.lr,
-            min_lr=self.config.lr * LAST_RATE,
-            batch=self.config.batch,
-            clouds=self._taught(),
-            parameters=(ParameterGroup(module="network"),),
+        """The network's rounds; the template is found before the first."""
+        rounds = self.config.rounds if self.config.camera == "known" else 1
+        return tuple(
+            Stage(
+                name=name,
+                epochs=self.config.epochs,
+                lr=self.config.lr,
+                min_lr=self.config.lr * LAST_RATE,
+                batch=self.config.batch,
+                clouds=self._taught(),
+                parameters=(ParameterGroup(module="network"),),
+            )
+            for name in [FIRST, *(f"round-{k + 1}" for k in range(1, rounds))]
         )
-        return (stage,)
 
     def _taught(self) -> int:
         """How many training clouds the network learns from."""
@@ -140,7 +145,9 @@ class AbstractRegistered(AbstractMethod):
         self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
     ) -> None:
         """Find the template, and its placement in the clouds that the network will learn."""
-        del stage
+        if stage != FIRST:
+            self._place(observation.points, generator)
+            return
         if len(observation.points) < LEAST_CLOUDS:
             raise ValueError(
                 f"training data: expected at least {LEAST_CLOUDS} clouds, "
@@ -159,21 +166,30 @@ class AbstractRegistered(AbstractMethod):
         self._set_pseudo_labels(cloud[:, 0], views, made.found)
         self.pseudo.belonging = inlier
         self._learn_orientation(views, made, seed)
-        self.cpu()
-        self._place(observation.points, generator)
         self.to(device)
+        self._place(observation.points, generator, LATE)
 
-    def _place(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
-        """Find what the network learns, as `quick` would, which keeps a few candidates."""
+    def _place(
+        self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator, begun: float = 0.0
+    ) -> None:
+        """Find on the host what the network learns, as `quick` would: a few candidates of each.
+
+        Args:
+            cloud: All training clouds.
+            generator: Of the training.
+            begun: Share of the start that is over before.
+        """
         if not isinstance(self.network, ViewNetwork):
             return
+        device = self.template.points.device
+        self.cpu()
         index = evenly(len(cloud), self.config.placed).to(cloud.device)
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
         makers = {kind.__name__: kind for kind in (Candidates, Placement)}
         parts, total = list[Candidates](), len(index)
         for number, some in enumerate(cloud[index].cpu().split(KEPT)):
             done = number * KEPT
-            share = LATE + (1 - LATE) * done / total
+            share = begun + (1 - begun) * done / total
             self.journal.tell(f"placing clouds, {done} of {total}", share, PLACING * (total - done))
             make = partial(self._candidates_of_all, some)
             parts.append(self.journal.once(f"placed clouds from {done} on", make, host, makers))
@@ -183,14 +199,15 @@ class AbstractRegistered(AbstractMethod):
         trust[found.margin.topk(count).indices] = 1.0
         self.targets.set(found, trust)
         self.network.learned.fill_(1.0)
+        self.to(device)
 
     def _candidates_of_all(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
         return cat([self._candidates(some) for some in cloud.split(PLACED)])
 
     def _candidates(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
-        limits = self._limits().wider(CHARGED)
         seen = self._seen(Observation(points=cloud))
-        return candidates(self.template, seen, self._space(), limits, self.config.quick_hypotheses)
+        left = self._settled(seen, self.config.quick_hypotheses, BRIEF)
+        return candidates(self.template, seen, left, self._limits().wider(CHARGED))
 
     def _observed(
         self, cloud: Float[Tensor, "B N 3"]
@@ -375,15 +392,19 @@ class AbstractRegistered(AbstractMethod):
         return final, found.margin
 
     def _hypotheses(self, seen: SeenClouds, refine: bool) -> Hypotheses:
-        """Those that are left in the end, charged where the network says otherwise."""
-        config, views, space = self.config, seen.views, self._space()
+        """Those that are left in the end."""
+        config, learned = self.config, self._has_learned()
         effort = THOROUGH if refine else BRIEF
+        beside = config.quick_beside if learned else config.quick_hypotheses
+        return self._settled(seen, config.grid_hypotheses if refine else beside, effort)
+
+    def _settled(self, seen: SeenClouds, beside: int, effort: Effort) -> Hypotheses:
+        """What is left of the network's and `beside` more, charged where it dissents."""
+        views, space = seen.views, self._space()
         if isinstance(self.network, PointVotes) or not self._has_learned():
-            count = config.grid_hypotheses if refine else config.quick_hypotheses
-            start = self._without_network(views, count)
+            start = self._without_network(views, beside)
             return successive_halving(self.template, views, start, space, effort)
         said, _, sure = self._voted(seen)
-        beside = config.grid_hypotheses if refine else config.quick_beside
         start = undeviated(said)
         if beside:
             start = interleave([start, space.propose(views, beside)], len(views.points))

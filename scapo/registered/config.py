@@ -103,8 +103,10 @@ class SearchConfig:
     of the placed ones from which the network learns."""
     placed: int = 2500
     """Training clouds in which the template is then searched for as `quick` does, 0.08 s each."""
+    rounds: int = 2
+    """How often that is done, and the network taught: from the second time on its word counts."""
     epochs: int = 32
-    """Epochs of the network."""
+    """Epochs of the network in a round."""
     lr: float = 2e-3
     """Learning rate of the network at the beginning; it falls to a hundredth on half a cosine."""
     batch: int = 32
@@ -160,7 +162,9 @@ def quick_config() -> RegisteredConfig:
         further_objects=8, further_views=8, contenders=1, heats=(), judged=16, mirror=False,
         halves=False, leans=False, final_points=800, dense_rounds=1,
     )  # fmt: skip
-    return RegisteredConfig(preset="quick", discovery=discovery, learned=120, placed=240, epochs=10)
+    return RegisteredConfig(
+        preset="quick", discovery=discovery, learned=120, placed=240, rounds=1, epochs=10
+    )
 
 
 PRESETS = {"cpu": cpu_config, "quick": quick_config}

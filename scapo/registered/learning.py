@@ -22,7 +22,7 @@ from scapo.registered.decode import nearest_weights
 from scapo.registered.joint_limits import JointLimits
 from scapo.registered.network import PointVotes, Target, random_frames, vote_losses
 from scapo.registered.outliers import replaced
-from scapo.registered.pose_search import BRIEF, LOSS_SHARE, SearchSpace, successive_halving
+from scapo.registered.pose_search import LOSS_SHARE, Hypotheses
 from scapo.registered.pseudo_labels import Candidates, PseudoLabels, ViewTargets
 from scapo.registered.template import (
     ArticulatedTemplate,
@@ -78,21 +78,17 @@ class SeenClouds:
 def candidates(
     template: ArticulatedTemplate,
     seen: SeenClouds,
-    space: SearchSpace,
+    left: Hypotheses,
     limits: JointLimits,
-    hypotheses: int,
 ) -> Candidates:
     """What `quick` would choose between, in each cloud's normalised frame.
 
     Args:
-        template: Is searched for.
+        template: Was searched for.
         seen: The clouds.
-        space: In which.
+        left: What is left of the search.
         limits: Of states, outside which candidates are charged.
-        hypotheses: With how many the search begins.
     """
-    start = space.propose(seen.views, hypotheses)
-    left = successive_halving(template, seen.views, start, space, BRIEF)
     placement, best = left.placement, left.best(limits)
     penalty = limits.penalty(placement.state.unflatten(0, left.loss.shape))
     cost = left.loss + left.unlike + penalty

@@ -32,7 +32,7 @@ from torch import Tensor
 from scapo.categories import Category
 from scapo.geometry.points import Similarity
 from scapo.method import changes
-from scapo.registered.base import AbstractRegistered, LearnedClouds
+from scapo.registered.base import FIRST, LATE, AbstractRegistered, LearnedClouds
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig
 from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
@@ -75,7 +75,7 @@ class TemplateRegistration(AbstractRegistered):
             ValueError: A run that was told more, or whose template has another size.
             StoreError: No such run (`load_run`).
         """
-        if self.config.start is None:
+        if self.config.start is None or stage != FIRST:
             super().start(stage, observation, labels, generator)
             return
         known = load_run(Path(self.config.start), self.category)
@@ -90,12 +90,12 @@ class TemplateRegistration(AbstractRegistered):
                 f"{len(known.template.points)} in {self.config.start}; "
                 f"add --discovery.final-points {len(known.template.points)}"
             )
-        device = self.template.points.device
         for name in ("template", "pseudo", "orientation"):
             getattr(self, name).load_state_dict(getattr(known, name).state_dict())
-        self.cpu()
-        self._place(observation.points, generator)
-        self.to(device)
+        sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
+        if sizes[0] == sizes[1]:
+            self.network.load_state_dict(known.network.state_dict())
+        self._place(observation.points, generator, LATE)
 
     @property
     def variant(self) -> str:

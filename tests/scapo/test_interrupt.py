@@ -51,8 +51,8 @@ def test_a_program_may_begin_in_another_thread() -> None:
 def test_a_reader_that_goes_away_is_no_error(program: str) -> None:
     """`scapo-bench --help | head -1`."""
     command = [Path(sys.executable).parent / program, "--help"]
-    pipe = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(command, text=True, **pipe) as running:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, text=True, stdout=pipe, stderr=pipe) as running:
         assert running.stdout
         assert running.stderr
         running.stdout.close()

@@ -200,11 +200,11 @@ def test_the_first_weights_come_from_the_seed_alone():
     assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
 
 
-def test_one_stage_over_the_clouds_that_were_placed():
+def test_rounds_over_the_clouds_that_were_placed():
     config = RegisteredConfig(epochs=3, placed=20)
     made = TemplateRegistration(config, CATEGORIES["drawer"], generator(0))
-    (stage,) = made.stages()
-    assert (stage.name, stage.epochs, stage.clouds) == ("votes", 3, 20)
+    stages = [(stage.name, stage.epochs, stage.clouds) for stage in made.stages()]
+    assert stages == [("votes", 3, 20), ("round-2", 3, 20)]
     assert made.variant == ""
     assert sum(p.numel() for p in made.parameters()) < 1_500_000
 

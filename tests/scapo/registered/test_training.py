@@ -77,7 +77,7 @@ def test_a_template_at_hand_is_learned_stored_and_gone_on_with(
     config = replace(CONFIG, learned=10, placed=10)
 
     def stopping(progress: fit.Progress) -> None:
-        if progress.epoch == 1:
+        if (progress.stage.name, progress.epoch) == ("round-2", 1):
             raise InterruptedRunError
 
     fit.fit(method(config), data, tmp_path / "whole", RUN)
@@ -170,6 +170,15 @@ def test_a_run_begins_at_another_ones_template_and_refuses_what_does_not_fit(
     second = load(tmp_path / "second").model
     assert isinstance(second, TemplateRegistration)
     assert torch.equal(second.template.points, made.template.points)
+    first = load(tmp_path / "first").model
+    assert isinstance(first, TemplateRegistration)
+    for channels, learned in ((begun.channels, True), (begun.channels // 2, False)):
+        another = method(replace(begun, channels=channels))
+        monkeypatch.setattr(another, "_place", lambda *_: None)
+        another.start("votes", clouds(10), Labels(), torch.Generator())
+        assert bool(another.network.learned) == learned  # it places with what it was taught
+        same = another.network.state_dict(), first.network.state_dict()
+        assert all(torch.equal(same[0][name], same[1][name]) for name in same[1]) or not learned
     g = torch.Generator()
     with pytest.raises(ValueError, match="was told instance; add --supervision instance"):
         method(replace(begun, supervision=())).start("votes", clouds(10), Labels(), g)
