@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from scapo.geometry.numerics import exact, uncompiled
+from scapo.geometry.numerics import at_least_float32, exact, uncompiled
 
 
 @torch.no_grad()
@@ -174,9 +174,9 @@ def farthest_points(
         raise ValueError(f"sampling: expected 1 to {points.shape[-2]} points, found {count}")
     if not 0 <= start < points.shape[-2]:
         raise ValueError(f"sampling: expected a start below {points.shape[-2]}, found {start}")
-    # On a CPU each of the many small steps would be compiled by itself, for minutes.
-    spread = _spread_as_it_is if points.device.type == "cpu" else _spread
-    return spread(points, count, start)
+    if points.device.type == "cpu":
+        return _spread_on_host(points, count, start)
+    return _spread(points, count, start)
 
 
 def _spread(points: Float[Tensor, "*B N D"], count: int, start: int) -> Int[Tensor, "*B {count}"]:
@@ -192,7 +192,24 @@ def _spread(points: Float[Tensor, "*B N D"], count: int, start: int) -> Int[Tens
     return torch.stack(indices, -1)
 
 
-_spread_as_it_is = uncompiled(_spread)
+@uncompiled  # each of the many small steps would be compiled by itself, for minutes
+def _spread_on_host(
+    points: Float[Tensor, "*B N D"], count: int, start: int
+) -> Int[Tensor, "*B {count}"]:
+    """The same by numpy, whose small steps take a quarter of the time of torch's."""
+    rows = at_least_float32(points).reshape(-1, *points.shape[-2:])
+    columns = rows.movedim(-1, 0).contiguous().numpy()
+    clouds = np.arange(columns.shape[1])
+    chosen = np.full(len(clouds), start)
+    distance = np.full(columns.shape[1:], np.inf, columns.dtype)
+    indices = [chosen]
+    for _ in range(count - 1):
+        off = columns - columns[:, clouds, chosen][..., None]
+        off *= off
+        np.minimum(distance, off.sum(0), out=distance)
+        chosen = distance.argmax(-1)
+        indices.append(chosen)
+    return torch.from_numpy(np.stack(indices, -1).reshape(*points.shape[:-2], count))
 
 
 @torch.no_grad()

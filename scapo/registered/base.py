@@ -46,6 +46,7 @@ from scapo.registered.network import (
 from scapo.registered.orientation import VIEWS_CHARGE, OrientationScorer
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
+    ALONE,
     BRIEF,
     CHARGED,
     THOROUGH,
@@ -337,13 +338,17 @@ class AbstractRegistered(AbstractMethod):
         index = farthest_points(clean, min(self.config.points, clean.shape[1]))
         kept = gather(clean, index)
         camera, frame = self._camera(observation, similarity, kept), own_frame(kept)
-        views = observe(clean @ frame.mT, (frame @ camera[..., None])[..., 0], index=index)
-        points = similarity.forward(cloud) @ frame.mT
+        clean, camera = clean @ frame.mT, (frame @ camera[..., None])[..., 0]
+        normals = surface_normals(clean, clean, camera)
         return SeenClouds(
-            points=points, clean=clean @ frame.mT, views=views, frame=frame,
-            similarity=similarity, inlier=inlier,
-            normals=surface_normals(clean @ frame.mT, clean @ frame.mT, views.camera),
-        )  # fmt: skip
+            points=similarity.forward(cloud) @ frame.mT,
+            clean=clean,
+            views=observe(clean, camera, index=index, normals=normals),
+            frame=frame,
+            similarity=similarity,
+            inlier=inlier,
+            normals=normals,
+        )
 
     def _voted(
         self, seen: SeenClouds
@@ -394,9 +399,10 @@ class AbstractRegistered(AbstractMethod):
     def _hypotheses(self, seen: SeenClouds, refine: bool) -> Hypotheses:
         """Those that are left in the end."""
         config, learned = self.config, self._has_learned()
-        effort = THOROUGH if refine else BRIEF
+        if refine:
+            return self._settled(seen, config.grid_hypotheses, THOROUGH)
         beside = config.quick_beside if learned else config.quick_hypotheses
-        return self._settled(seen, config.grid_hypotheses if refine else beside, effort)
+        return self._settled(seen, beside, BRIEF if beside else ALONE)
 
     def _settled(self, seen: SeenClouds, beside: int, effort: Effort) -> Hypotheses:
         """What is left of the network's and `beside` more, charged where it dissents."""

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.geometry.points import Similarity, k_nearest
+from scapo.geometry.points import Similarity, k_nearest_by_tree
 from scapo.geometry.rigid import rigid
 from scapo.registered.joint_limits import JointLimits
 from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
@@ -132,7 +132,7 @@ def smoothed(
 
     The labels of single template points are noisy where two parts meet.
     """
-    index = k_nearest(source, target, min(NEIGHBOURS, len(target)))
+    index = k_nearest_by_tree(source, target, min(NEIGHBOURS, len(target)))
     off = (source[:, None] - target[index]).square().sum(-1)
     share = torch.exp((off[:, :1] - off) / (2 * REACH**2))
     share = share / share.sum(-1, keepdim=True)

@@ -35,7 +35,7 @@ def inlier_mask(points: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
 
 
 def _inliers(cloud: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-    distinct, which = torch.unique(cloud, dim=0, return_inverse=True)
+    distinct, which = _distinct(cloud)
     total = len(distinct)
     if total > MOST:
         some = distinct[torch.linspace(0, total - 1, MOST, device=cloud.device).long()]
@@ -44,6 +44,18 @@ def _inliers(cloud: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
     label = _clusters(distinct)[which]
     size = torch.bincount(label, minlength=len(distinct))
     return size[label] >= min(LEAST * len(cloud), float(size.max()))
+
+
+def _distinct(cloud: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "M 3"], Int[Tensor, " N"]]:
+    """Every point once, and which of these each point is; several times as fast as torch.unique."""
+    points = cloud.cpu().numpy()
+    order = np.lexsort(points.T[::-1])
+    ordered = points[order]
+    first = np.r_[True, (ordered[1:] != ordered[:-1]).any(1)]
+    which = np.zeros(len(points), np.int64)
+    which[order] = first.cumsum() - 1
+    found, index = torch.from_numpy(ordered[first]), torch.from_numpy(which)
+    return found.to(cloud.device), index.to(cloud.device)
 
 
 def _clusters(points: Float[Tensor, "M 3"]) -> Int[Tensor, " M"]:

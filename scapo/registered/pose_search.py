@@ -75,6 +75,14 @@ BRIEF = Effort(
     long=StepOptions(steps=4, points=96, template_points=96),
     last=StepOptions(steps=2, points=192),
 )
+ALONE = Effort(
+    proposed=1,
+    rungs=(),
+    again=False,
+    long=StepOptions(steps=5, points=96, template_points=96),
+    last=StepOptions(steps=3, points=192),
+)
+"""Of one hypothesis of a view, with nothing to rank."""
 PROPOSED = 32  # Placements that banks propose where fewer are asked for of those that stand right
 STATES = (150.0, 250.0)  # Sharpness of the losses by which the winner's states are tried
 STATE_GRID, STATE_EVERY = 13, 2

@@ -94,6 +94,7 @@ def observe(
     *,
     count: int = 256,
     index: Int[Tensor, "B K"] | None = None,
+    normals: Float[Tensor, "B N 3"] | None = None,
 ) -> PartialViews:
     """The views of normalised clouds.
 
@@ -102,15 +103,17 @@ def observe(
         camera: The camera's centre in the same frame; estimated or known.
         count: Points kept, or all where there are fewer.
         index: Those points, where they are known (`farthest_points`).
+        normals: Of all points, where they are known (`surface_normals`).
     """
     if index is None:
         index = farthest_points(points, min(count, points.shape[1]))
     kept = gather(points, index)
+    own = surface_normals(kept, points, camera) if normals is None else gather(normals, index)
     look = look_along(camera)
     depth, centre, half = _depth_image(points, camera, look)
     return PartialViews(
         points=kept,
-        normals=surface_normals(kept, points, camera),
+        normals=own,
         camera=camera,
         look=look,
         depth=depth,

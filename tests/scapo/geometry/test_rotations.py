@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.geometry import rigid as geometry
+from scapo.geometry.rotations import FEW, special_procrustes
 from tests.helpers.strategies import (
     batch_shapes,
     generator,
@@ -131,6 +132,15 @@ def test_project_rotation_is_the_nearest_rotation(seed: int, shape: tuple[int, .
     assert_close(torch.linalg.det(found), torch.ones(shape, dtype=torch.float64))
     rotation = rotations(seed, *shape)
     assert_close(geometry.project_rotation(rotation), rotation)
+
+
+def test_few_and_many_are_projected_alike() -> None:
+    """By singular vectors, and by roma: of many, and where there are gradients."""
+    matrices = normal(5, FEW, 3, 3)
+    many, few = special_procrustes(matrices), matrices[:20]
+    assert (torch.linalg.det(few) < 0).any()
+    assert_close(special_procrustes(few), many[:20], atol=1e-8, rtol=0)
+    assert_close(special_procrustes(few.clone().requires_grad_()).detach(), many[:20])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
