@@ -56,10 +56,14 @@ def exit_interrupted(line: str = "") -> NoReturn:
     sys.exit(INTERRUPTED)
 
 
-def exit_unheard() -> NoReturn:
-    """End the process whose output nobody reads any more (`scapo-bench --help | head`), silently.
+def exit_if_unheard() -> None:
+    """End silently the process whose output nobody reads any more (`scapo-bench --help | head`).
 
-    What is still buffered goes nowhere, or the interpreter would complain of it at its end.
+    A pipe that broke elsewhere, as to a worker, is left to the caller. What is still buffered goes
+    nowhere, or the interpreter would complain of it at its end.
     """
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(UNHEARD)
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(UNHEARD)

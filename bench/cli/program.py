@@ -16,7 +16,7 @@ from rich.logging import RichHandler
 from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
 from bench.requests import UsageError
-from scapo.interrupt import exit_interrupted, exit_unheard
+from scapo.interrupt import exit_if_unheard, exit_interrupted
 from scapo.text import unknown_word
 
 DESCRIPTION = (
@@ -75,9 +75,9 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except MemoryError as error:
         say(errors, f"scapo-bench: expected enough memory, found: {error}")
         sys.exit(1)
-    except BrokenPipeError:
-        exit_unheard()
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
+        if isinstance(error, BrokenPipeError):
+            exit_if_unheard()
         say(errors, f"scapo-bench: {error}")
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt as stop:

@@ -134,6 +134,11 @@ class SearchConfig:
     """Whether the camera is known, or another network, in the principal frames of the learned
     clouds, has to say where it is."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError where the network would never be taught."""
+        if self.rounds < 1:
+            raise ValueError(f"rounds: expected at least 1, found {self.rounds}")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredConfig(SearchConfig):

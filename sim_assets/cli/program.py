@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 from rich.text import Text
 
-from scapo.interrupt import exit_interrupted, exit_unheard
+from scapo.interrupt import exit_if_unheard, exit_interrupted
 from scapo.text import one_line, unknown_word
 from sim_assets.cli.verbs import VERBS, UsageError
 
@@ -47,9 +47,9 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except MemoryError as error:
         _say(errors, f"scapo-data: expected enough memory, found: {error}")
         sys.exit(1)
-    except BrokenPipeError:
-        exit_unheard()
     except (ValueError, OSError, RuntimeError) as error:
+        if isinstance(error, BrokenPipeError):
+            exit_if_unheard()
         _say(errors, f"scapo-data: {error}")
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import pytest
 
-from scapo.registered.config import DiscoveryConfig, cpu_config, quick_config
+from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.course import plan_of
 
 
@@ -19,6 +19,8 @@ def test_a_grid_too_coarse_is_refused() -> None:
 def test_a_dense_template_that_would_never_be_built_is_refused() -> None:
     with pytest.raises(ValueError, match="dense_rounds: expected at least 1, found 0"):
         DiscoveryConfig(dense_rounds=0)
+    with pytest.raises(ValueError, match=r"^rounds: expected at least 1, found 0"):
+        RegisteredConfig(rounds=0)
 
 
 def test_the_quick_preset_does_less_of_the_same() -> None:
