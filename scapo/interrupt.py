@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import sys
 import threading
@@ -62,8 +63,8 @@ def exit_if_unheard() -> None:
     A pipe that broke elsewhere, as to a worker, is left to the caller. What is still buffered goes
     nowhere, or the interpreter would complain of it at its end.
     """
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    stdout, poll = sys.stdout.fileno(), select.poll()
+    poll.register(stdout, 0)  # errors are told of whatever is asked for
+    if any(event & select.POLLERR for _, event in poll.poll(0)):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stdout)
         sys.exit(UNHEARD)
