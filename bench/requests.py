@@ -252,6 +252,9 @@ class TrainRequest(Generic[M]):
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, cuda:1, ..."""
     seed: int = 1
     """Seed of the first weights, the order of the data and the augmentation."""
+    workers: int | None = None
+    """Processes for what the start of a stage can do side by side, beside this one, which waits;
+    by default as many as torch has threads (OMP_NUM_THREADS)."""
     resume: bool = False
     """Continue the run in that folder, or begin it where there is none."""
     log_every: int = 10

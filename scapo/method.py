@@ -7,7 +7,7 @@ Methods that can be given labels at test time, such as ICP with true parts: decl
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -21,6 +21,7 @@ from scapo.types import Labels, Observation, Prediction, Supervision
 
 Mode = Literal["fast", "quick", "refine"]
 T = TypeVar("T")
+SEEDS = 2**31  # Of generators
 
 
 class Journal:
@@ -57,6 +58,27 @@ class Journal:
         """
         del name, generator, makers
         return make()
+
+    def ahead(self, jobs: Sequence[Callable[[], T]]) -> Sequence[Callable[[], T]]:
+        """What returns the same as the jobs, asked once each and in their order.
+
+        Training may begin on all of them, side by side in several processes, when the first one is
+        asked for. So none may need what another does, draw from what another draws from, or be
+        without a pickle; what a job changes in place may be a copy.
+
+        Args:
+            jobs: What is to be done.
+        """
+        return jobs
+
+
+NO_JOURNAL = Journal()
+
+
+def own_generators(generator: torch.Generator, count: int) -> list[torch.Generator]:
+    """Generators on the host, seeded by one, for what is done side by side (`Journal.ahead`)."""
+    seeds = torch.randint(SEEDS, (count,), generator=generator, device=generator.device)
+    return [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

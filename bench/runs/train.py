@@ -83,6 +83,7 @@ def _fit(
         checkpoint_every=request.checkpoint_every,
         arithmetic=precision,
         pictures_every=request.pictures_every if request.pictures else None,
+        workers=torch.get_num_threads() if request.workers is None else request.workers,
     )
     size = sum(parameter.numel() for parameter in method.parameters())
     if say is not None:

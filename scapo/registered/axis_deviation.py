@@ -16,7 +16,9 @@ tells.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import torch
@@ -25,6 +27,7 @@ from torch import Tensor
 
 from scapo.geometry.points import gather
 from scapo.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from scapo.method import NO_JOURNAL, Journal, own_generators
 from scapo.records import cat, take
 from scapo.registered.bundle_adjustment import (
     Candidate,
@@ -83,7 +86,11 @@ DAMPING, MOST_TURN = 0.01, 0.15  # Added to the diagonal of a step's system, and
 
 
 def with_axis_deviation(
-    start: Candidate, judges: PartialViews, config: DiscoveryConfig, generator: torch.Generator
+    start: Candidate,
+    judges: PartialViews,
+    config: DiscoveryConfig,
+    generator: torch.Generator,
+    journal: Journal = NO_JOURNAL,
 ) -> Candidate:
     """The start, or one whose axes deviate where that explains held-out views far better.
 
@@ -94,13 +101,14 @@ def with_axis_deviation(
     if "revolute" not in template.kinds:
         return start
     options = replace(late_options(template, config), axis_weight=0.0)
-    tried = [start, *deviating_templates(start, options, generator)]
+    tried = [start, *deviating_templates(start, options, generator, journal)]
     if len(tried) == 1:
         return start
     limits = limits_of(inliers.placement.state, template.kinds)
     found = search_views(start, judges)
     placed = refine_states(template, judges, found, limits)
-    loss = torch.stack([refine_deviations(one.template, judges, placed)[1] for one in tried])
+    jobs = [partial(refine_deviations, one.template, judges, placed) for one in tried]
+    loss = torch.stack([job()[1] for job in journal.ahead(jobs)])
     least = loss.amin(0)
     losses = loss[:, least <= least.quantile(JUDGED)].mean(1).tolist()
     logger.info("templates with axis deviation judged: %s", " ".join(f"{x:.3f}" for x in losses))
@@ -109,7 +117,10 @@ def with_axis_deviation(
 
 
 def deviating_templates(
-    start: Candidate, options: FitOptions, generator: torch.Generator
+    start: Candidate,
+    options: FitOptions,
+    generator: torch.Generator,
+    journal: Journal = NO_JOURNAL,
 ) -> list[Candidate]:
     """Templates whose axes deviate, one for each choice of ends at which they rest.
 
@@ -117,22 +128,24 @@ def deviating_templates(
         start: A template whose axes do not, and inliers.
         options: Of the fits.
         generator: Of the draws in between.
+        journal: Of the training.
 
     Returns:
         Templates with the same views; none where the axes deviate too little.
     """
     views, placement = start.inliers.views, start.inliers.placement
     thin, observed = _made_thin(start.template, views, placement, generator)
-    made = []
-    for rests in _rests(limits_of(placement.state, start.template.kinds)):
-        model = learn_deviations(observed, placement.state, rests)
+    rests = _rests(limits_of(placement.state, start.template.kinds))
+    own, jobs = own_generators(generator, len(rests)), list[Callable[[], Candidate]]()
+    for ends, one in zip(rests, own, strict=True):
+        model = learn_deviations(observed, placement.state, ends)
         if float(model.load.unflatten(0, (-1, 2)).norm(dim=-1).max()) >= LEAST_DEVIATION:
-            one = thin.with_points(len(thin.points))
-            keep(one, model)
-            at = with_deviations(one, observed, placement)
-            at = _fitted(one, views, at, rests, options, generator)
-            made.append(Candidate(template=one, inliers=Inliers(views=views, placement=at)))
-    return made
+            template = thin.with_points(len(thin.points))
+            keep(template, model)
+            at = with_deviations(template, observed, placement)
+            found = Candidate(template=template, inliers=Inliers(views=views, placement=at))
+            jobs.append(partial(_fitted, found, ends, options, one))
+    return [job() for job in journal.ahead(jobs)]
 
 
 def _made_thin(
@@ -163,14 +176,10 @@ def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:
 
 
 def _fitted(
-    template: ArticulatedTemplate,
-    views: PartialViews,
-    placement: Placement,
-    rests: Float[Tensor, "J R"],
-    options: FitOptions,
-    generator: torch.Generator,
-) -> Placement:
-    """Rounds of fitting a template and learning deviations, in place; the placements."""
+    found: Candidate, rests: Float[Tensor, "J R"], options: FitOptions, generator: torch.Generator
+) -> Candidate:
+    """Rounds of fitting a template, in place, and learning deviations."""
+    template, views, placement = found.template, found.inliers.views, found.inliers.placement
     for number in range(ROUNDS):
         if number == 1:
             rebuild(template, views, placement, generator=generator)
@@ -178,7 +187,7 @@ def _fitted(
         observed = observe_part_rotations(template, views, placement, REACHES)
         keep(template, learn_deviations(observed, placement.state, rests))
         placement = with_deviations(template, observed, placement)
-    return placement
+    return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,7 @@ from torch import Tensor
 from scapo.categories import Category, JointKind
 from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
-from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
+from scapo.method import NO_JOURNAL, AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
 from scapo.pictures import PictureData
 from scapo.records import cat, take
 from scapo.registered.axis_deviation import refine_deviations
@@ -76,7 +76,7 @@ from scapo.types import Labels, Observation, Prediction
 LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
 FIRST = "votes"  # Stage of the network's first round
 LAST_RATE = 0.01  # Share of the learning rate at the end
-PLACED, KEPT = 50, 500  # Clouds that are placed at a time, and after which what was found is kept
+PLACED, KEPT = 50, 250  # Clouds that are placed at a time, and after which what was found is kept
 PLACING, LATE = 0.08, 0.8
 """Seconds of one core for each of them, and the share of the start that is over before."""
 ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
@@ -121,6 +121,10 @@ class AbstractRegistered(AbstractMethod):
         self.pseudo, self.targets = PseudoLabels(), ViewTargets()
         self.orientation = OrientationScorer()
         self._drawn: tuple[list[tuple[int, int, torch.device]], SearchSpace] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process needs: neither what was drawn nor the journal."""
+        return {**self.__dict__, "_drawn": None, "journal": NO_JOURNAL}
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's rounds; the template is found before the first."""
@@ -184,15 +188,15 @@ class AbstractRegistered(AbstractMethod):
             return
         device = self.template.points.device
         self.cpu()
+        self.targets.clear()
         index = evenly(len(cloud), self.config.placed).to(cloud.device)
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
         makers = {kind.__name__: kind for kind in (Candidates, Placement)}
         parts, total = list[Candidates](), len(index)
-        for number, some in enumerate(cloud[index].cpu().split(KEPT)):
-            done = number * KEPT
+        jobs = [partial(self._candidates_of_all, some) for some in cloud[index].cpu().split(KEPT)]
+        for done, make in zip(range(0, total, KEPT), self.journal.ahead(jobs), strict=True):
             share = begun + (1 - begun) * done / total
             self.journal.tell(f"placing clouds, {done} of {total}", share, PLACING * (total - done))
-            make = partial(self._candidates_of_all, some)
             parts.append(self.journal.once(f"placed clouds from {done} on", make, host, makers))
         found = cat(parts)
         trust = torch.zeros_like(found.margin)

@@ -16,14 +16,14 @@ judged against the one without, after both went through a round.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 
 from scapo.categories import JointKind
-from scapo.method import Journal, evenly
+from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
 from scapo.records import take
 from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
@@ -78,7 +78,7 @@ def discover(
     config: DiscoveryConfig,
     generator: torch.Generator,
     objects: ObjectViews = NO_OBJECTS,
-    journal: Journal = Journal(),  # noqa: B008 - it has no state
+    journal: Journal = NO_JOURNAL,
 ) -> Discovery:
     """The articulated template of views of one category, and its placement in all of them.
 
@@ -110,10 +110,11 @@ def discover(
     dense = partial(densified, best, config, generator, config.dense_rounds)
     best = course.step("dense template", dense)
     if config.leans and "revolute" in kinds:
-        deviating = partial(with_axis_deviation, best, judges, config, generator)
+        deviating = partial(with_axis_deviation, best, judges, config, generator, journal)
         best = course.step("deviating axes", deviating)
     scorer = _how_objects_stand(best, known, objects.further, config, course) if known else None
-    found = course.step("search of all views", partial(search_views, best, views, scorer))
+    searching = partial(search_views, best, views, scorer, journal)
+    found = course.step("search of all views", searching)
     return Discovery(template=best.template, found=found, scorer=scorer)
 
 
@@ -157,23 +158,25 @@ def _known_objects(
     course: Course,
 ) -> list[OneObject]:
     """The objects each by itself, the surest first."""
-    return surest_first(
-        [
-            course.step(name, partial(one_object, views, kinds, config, course.generator))
-            for name, views in zip(numbered("object", len(objects)), objects, strict=True)
-        ]
-    )
+    names, own = numbered("object", len(objects)), own_generators(course.generator, len(objects))
+    jobs = {
+        name: partial(one_object, views, kinds, config, generator)
+        for name, views, generator in zip(names, objects, own, strict=True)
+    }
+    return surest_first(course.steps(jobs))
 
 
 def _of_objects(
     known: list[OneObject], kinds: tuple[JointKind, ...], config: DiscoveryConfig, course: Course
 ) -> list[Candidate]:
     """The first candidates of all draws of objects."""
-    draws, generator = draws_of(known, config.draws), course.generator
-    return [
-        course.step(f"{name}, template", partial(object_candidate, draw, kinds, config, generator))
-        for name, draw in zip(numbered("draw", len(draws)), draws, strict=True)
-    ]
+    draws = draws_of(known, config.draws)
+    names, own = numbered("draw", len(draws)), own_generators(course.generator, len(draws))
+    jobs = {
+        f"{name}, template": partial(object_candidate, draw, kinds, config, generator)
+        for name, draw, generator in zip(names, draws, own, strict=True)
+    }
+    return course.steps(jobs)
 
 
 def _how_objects_stand(
@@ -184,12 +187,14 @@ def _how_objects_stand(
     course: Course,
 ) -> OrientationScorer | None:
     """What tells of any view how it stands, learned from objects against the final template."""
-    posed = [one.posed for one in known]
-    for name, views in zip(numbered("further object", len(further)), further, strict=True):
-        frame = partial(common_frame, views, config.rotations, AGREEING, OWN_HIDDEN_COST)
-        posed.append(course.step(name, frame))
-    owned, kinds = all_views(posed), best.template.kinds
-    hypotheses = course.step("search of objects", partial(search_near, best, owned.views))
+    names = numbered("further object", len(further))
+    jobs = {
+        name: partial(common_frame, views, config.rotations, AGREEING, OWN_HIDDEN_COST)
+        for name, views in zip(names, further, strict=True)
+    }
+    owned = all_views([*(one.posed for one in known), *course.steps(jobs)])
+    searching = partial(search_near, best, owned.views, journal=course.journal)
+    hypotheses, kinds = course.step("search of objects", searching), best.template.kinds
     taught = partial(taught_by_objects, known, kinds, owned, hypotheses, course.generator)
     return course.step("how objects stand", taught)
 
@@ -202,15 +207,19 @@ def _best(
     course: Course,
 ) -> Candidate:
     """The winner of the tournament: candidates are judged, go through the rungs, and again."""
-    order = course.step("judging first templates", partial(ranked, tried, judges, config))
+    judging = partial(ranked, tried, judges, config, course.journal)
+    order = course.step("judging first templates", judging)
     left = [tried[k] for k in order[: config.finalists]]
     for rung, share in zip(numbered("rung", len(config.heats)), config.heats, strict=True):
         names = [f"{rung}, {one}" for one in numbered("template", len(left))]
-        left = [
-            course.step(name, partial(advance, one, searched, share, config, course.generator))
-            for name, one in zip(names, left, strict=True)
-        ]
-    return left[course.step("judging templates", partial(ranked, left, judges, config))[0]]
+        own = own_generators(course.generator, len(left))
+        jobs = {
+            name: partial(advance, one, searched, share, config, generator)
+            for name, one, generator in zip(names, left, own, strict=True)
+        }
+        left = course.steps(jobs)
+    judging = partial(ranked, left, judges, config, course.journal)
+    return left[course.step("judging templates", judging)[0]]
 
 
 def _through_rounds(
@@ -234,7 +243,7 @@ def _through_rounds(
         best = completed(best, judges, searched[0], config, course)
         rounds.pop(next(iter(rounds)))
     for name, share in rounds.items():
-        one = partial(advance, best, searched[1], share, config, course.generator)
+        one = partial(_advance_alone, best, searched[1], share, config, course)
         best = course.step(name, one)
         logger.info("bundle adjustment of %d inliers", len(best.inliers.views.points))
     if config.halves and config.trusted and may_have_halves(best.template):
@@ -242,11 +251,17 @@ def _through_rounds(
     return best
 
 
-def ranked(tried: list[Candidate], judges: PartialViews, config: DiscoveryConfig) -> list[int]:
+def ranked(
+    tried: list[Candidate],
+    judges: PartialViews,
+    config: DiscoveryConfig,
+    journal: Journal = NO_JOURNAL,
+) -> list[int]:
     """The candidates by how well they explain the held-out views, the best first."""
     if len(tried) == 1:
         return [0]
-    losses = [unexplained(one, judges, config) for one in tried]
+    jobs = [partial(unexplained, one, judges, config) for one in tried]
+    losses = [job() for job in journal.ahead(jobs)]
     order = sorted(range(len(tried)), key=losses.__getitem__)
     logger.info("templates judged: %s; best: %s", " ".join(f"{x:.3f}" for x in losses), order)
     return order
@@ -266,6 +281,14 @@ def advance(
     return refit(found, config, generator)
 
 
+def _advance_alone(
+    candidate: Candidate, searched: Searched, share: float, config: DiscoveryConfig, course: Course
+) -> Candidate:
+    """The same of the only candidate, its views side by side."""
+    found = find_inliers(candidate, searched, share, config, journal=course.journal)
+    return refit(found, config, course.generator)
+
+
 def completed(
     candidate: Candidate,
     judges: PartialViews,
@@ -282,18 +305,17 @@ def completed(
     sought anywhere.
     """
     wholes = [replace(candidate, template=mirrored(candidate.template, axis)) for axis in range(3)]
-    share, generator = config.trusted[0], course.generator
     first = numbered("round", len(config.trusted))[0]
     names = [f"{first}, {one}" for one in numbered("mirror image", len(wholes) + 1)]
-    tried = [
-        course.step(name, partial(advance, one, searched, share, config, generator, anywhere=new))
-        for name, one, new in zip(
-            names, [candidate, *wholes], [False, True, True, True], strict=True
-        )
-    ]
-    losses = course.step(
-        "judging mirror images", partial(_dense_losses, tried, judges, config, generator)
-    )
+    own, jobs = own_generators(course.generator, len(names)), dict[str, Callable[[], Candidate]]()
+    for name, one, generator in zip(names, [candidate, *wholes], own, strict=True):
+        jobs[name] = partial(
+            advance, one, searched, config.trusted[0], config, generator,
+            anywhere=one is not candidate,
+        )  # fmt: skip
+    tried = course.steps(jobs)
+    judging = partial(_dense_losses, tried, judges, config, course)
+    losses = course.step("judging mirror images", judging)
     best = min(range(len(tried)), key=losses.__getitem__)
     shown = " ".join(f"{x:.3f}" for x in losses)
     logger.info("template as it is and with mirror images judged: %s; kept: %d", shown, best)
@@ -311,17 +333,16 @@ def _or_in_halves(
 
     As mirror images they are judged by dense templates.
     """
-    generator, share = course.generator, config.trusted[-1]
 
     def halved() -> Candidate:
-        tried = in_halves(best, generator)
-        losses = _dense_losses(tried, judges, config, generator)
+        tried = in_halves(best, course.generator, course.journal)
+        losses = _dense_losses(tried, judges, config, course)
         logger.info("cuts in two judged: %s", " ".join(f"{loss:.3f}" for loss in losses))
         chosen = tried[min(range(len(tried)), key=losses.__getitem__)]
-        return advance(chosen, searched, share, config, generator)
+        return _advance_alone(chosen, searched, config.trusted[-1], config, course)
 
     tried = [best, course.step("two halves", halved)]
-    judged = partial(_dense_losses, tried, judges, config, generator)
+    judged = partial(_dense_losses, tried, judges, config, course)
     was, now = course.step("judging halves", judged)
     logger.info("template as it is and in two halves judged: %.3f %.3f", was, now)
     return tried[now < was and are_halves(tried[1].template)]
@@ -331,10 +352,21 @@ def _dense_losses(
     tried: list[Candidate],
     judges: PartialViews,
     config: DiscoveryConfig,
-    generator: torch.Generator,
+    course: Course,
 ) -> list[float]:
     """What held-out views cost the candidates with dense templates."""
-    return [unexplained(densified(one, config, generator), judges, config) for one in tried]
+    own = own_generators(course.generator, len(tried))
+    jobs = [
+        partial(_dense_loss, one, judges, config, generator)
+        for one, generator in zip(tried, own, strict=True)
+    ]
+    return [job() for job in course.journal.ahead(jobs)]
+
+
+def _dense_loss(
+    one: Candidate, judges: PartialViews, config: DiscoveryConfig, generator: torch.Generator
+) -> float:
+    return unexplained(densified(one, config, generator), judges, config)
 
 
 @torch.no_grad()

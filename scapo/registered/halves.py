@@ -17,13 +17,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from scapo.geometry.rotations import rotvec_to_rotmat
-from scapo.method import evenly
+from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
 from scapo.records import take
 from scapo.registered.bundle_adjustment import (
     BLUNT,
@@ -67,12 +68,17 @@ def are_halves(template: ArticulatedTemplate) -> bool:
     return LEAST_HALF <= share <= 1 - LEAST_HALF
 
 
-def in_halves(candidate: Candidate, generator: torch.Generator) -> list[Candidate]:
+def in_halves(
+    candidate: Candidate,
+    generator: torch.Generator,
+    journal: Journal = NO_JOURNAL,
+) -> list[Candidate]:
     """Templates of two like halves on some of the candidate's inliers, those that fit best.
 
     Args:
         candidate: With one hinge (`may_have_halves`); it stays as it is.
         generator: Draws points.
+        journal: Of the training.
     """
     template = candidate.template
     some = evenly(len(candidate.inliers.views.points), FITTED)
@@ -81,7 +87,12 @@ def in_halves(candidate: Candidate, generator: torch.Generator) -> list[Candidat
     starts = (at_rest(placement), to_the_middle(template, placement))
     fits = [_Fit(cut, start) for start in starts for cut in cuts(template)]
     for number, kept in enumerate(KEPT):
-        fits = [_round(fit, views, generator, number=number) for fit in fits]
+        own = own_generators(generator, len(fits))
+        jobs = [
+            partial(_round, fit, views, one, number=number)
+            for fit, one in zip(fits, own, strict=True)
+        ]
+        fits = [job() for job in journal.ahead(jobs)]
         fits = sorted(fits, key=lambda fit: fit.loss)[:kept]
         logger.info("cuts in two fitted: %s", " ".join(f"{fit.loss:.4f}" for fit in fits))
     return [

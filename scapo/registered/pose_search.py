@@ -9,13 +9,14 @@ successive halving; what tells them apart is the same loss that bundle adjustmen
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.method import evenly
+from scapo.method import NO_JOURNAL, Journal, evenly
 from scapo.records import cat, take
 from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import DiscoveryConfig
@@ -28,7 +29,7 @@ from scapo.registered.template import ArticulatedTemplate, Placement, interleave
 from scapo.registered.view_bank import ShownPoints, ViewBank
 from scapo.registered.views import PartialViews
 
-VIEWS = 64  # Views searched at once: each has `SearchSpace.keep` hypotheses
+VIEWS = 36  # Views searched at once: each has `SearchSpace.keep` hypotheses
 STATES_OF_ONE, STATES_OF_EACH = 7, 4
 """States of the grid where the category has one joint, and of each joint where it has more."""
 ROOM_SLIDING, ROOM = 0.1, 0.3
@@ -237,6 +238,7 @@ def find_inliers(
     config: DiscoveryConfig,
     *,
     anywhere: bool = False,
+    journal: Journal = NO_JOURNAL,
 ) -> Candidate:
     """The template with that share of the views as inliers, those that it explains best.
 
@@ -246,9 +248,10 @@ def find_inliers(
         share: Of them.
         config: Rotations, and the cost of a range of states.
         anywhere: Whether cameras are sought anywhere.
+        journal: Of the training.
     """
     views = searched.views if isinstance(searched, OwnedViews) else searched
-    hypotheses = search_near(candidate, views, anywhere=anywhere)
+    hypotheses = search_near(candidate, views, anywhere=anywhere, journal=journal)
     found, limits = _within_limits(candidate, hypotheses, config)
     if isinstance(searched, OwnedViews):
         found, agrees = voted(hypotheses, limits, searched)
@@ -263,10 +266,12 @@ def search_views(
     candidate: Candidate,
     views: PartialViews,
     scorer: OrientationScorer | None = None,
+    journal: Journal = NO_JOURNAL,
 ) -> SearchResult:
     """The best placement of every view with states that inliers have."""
     limits = limits_of(candidate.inliers.placement.state, candidate.template.kinds)
-    return search_near(candidate, views, scorer=scorer).best(limits.wider(CHARGED))
+    found = search_near(candidate, views, scorer=scorer, journal=journal)
+    return found.best(limits.wider(CHARGED))
 
 
 def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConfig) -> float:
@@ -293,6 +298,7 @@ def search_near(
     *,
     anywhere: bool = False,
     scorer: OrientationScorer | None = None,
+    journal: Journal = NO_JOURNAL,
 ) -> Hypotheses:
     """Every view over rotations, states and shifts, cameras near those of inliers or anywhere."""
     template, inliers = candidate.template, candidate.inliers
@@ -308,7 +314,7 @@ def search_near(
         states=states,
         scorer=scorer,
     )
-    return search(template, views, space)
+    return search(template, views, space, journal=journal)
 
 
 def modes_of(placement: Placement, states: Float[Tensor, "J S"]) -> Placement:
@@ -339,15 +345,19 @@ def search(
     views: PartialViews,
     space: SearchSpace,
     effort: Effort = THOROUGH,
+    journal: Journal = NO_JOURNAL,
 ) -> Hypotheses:
     """The best placements of every view over all rotations and states."""
-    return cat(
-        [
-            successive_halving(template, some, space.propose(some, effort.proposed), space, effort)
-            for index in torch.arange(len(views.points), device=views.points.device).split(VIEWS)
-            for some in [take(views, index)]
-        ]
-    )
+    rows = torch.arange(len(views.points), device=views.points.device).split(VIEWS)
+    jobs = [partial(_search_some, template, take(views, index), space, effort) for index in rows]
+    return cat([job() for job in journal.ahead(jobs)])
+
+
+def _search_some(
+    template: ArticulatedTemplate, views: PartialViews, space: SearchSpace, effort: Effort
+) -> Hypotheses:
+    start = space.propose(views, effort.proposed)
+    return successive_halving(template, views, start, space, effort)
 
 
 def combinations(states: Float[Tensor, "J S"]) -> Float[Tensor, "C J"]:

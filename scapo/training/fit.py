@@ -56,6 +56,8 @@ class FitConfig:
     """Seconds after which the end of an epoch saves the state."""
     clip: float = 10.0
     """Largest norm of the gradient; longer ones are scaled down."""
+    workers: int = 0
+    """Processes for what a start can do side by side; with fewer than two, this process alone."""
     arithmetic: Arithmetic = field(default_factory=Arithmetic)
     """Precision and compilation of the networks."""
     pictures_every: float | None = 300.0
@@ -242,12 +244,13 @@ class Trainer:
                 Progress(stage=stage, epoch=0, done=done, loss=None, step=words, left=left)
             )
 
-        self.method.journal = journal = self.folder.journal(stage.name, tell)
-        try:
-            observation, labels = self.data.observation, self.data.labels
-            self.method.start(stage.name, observation, labels, self.state.noise)
-        finally:
-            self.method.journal = Journal()
+        with self.folder.journal(stage.name, tell, self.config.workers) as journal:
+            self.method.journal = journal
+            try:
+                observation, labels = self.data.observation, self.data.labels
+                self.method.start(stage.name, observation, labels, self.state.noise)
+            finally:
+                self.method.journal = Journal()
         return journal.earlier
 
     def _stage(self, stage: Stage, optimizer: Optimizer) -> None:

@@ -10,16 +10,20 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, TypeVar, cast, final
 
 import torch
 
 from scapo.method import Journal
+from scapo.parallel.ahead import Numbered, ahead
+from scapo.parallel.pool import Pool
 from scapo.records import pack, unpack
 from scapo.store.checkpoint import array
 from scapo.store.files import Arrays, Header, canonical_json, read, sha256_bytes, write
@@ -53,10 +57,15 @@ class StepHeader:
 
 @final
 class StoredJournal(Journal):
-    """A journal in a folder, of one stage of one run."""
+    """A journal in a folder, of one stage of one run; leaving it ends its processes."""
 
     def __init__(
-        self, folder: Path, run: Header, stage: str, tell: Callable[[str, float, float], None]
+        self,
+        folder: Path,
+        run: Header,
+        stage: str,
+        tell: Callable[[str, float, float], None],
+        workers: int = 0,
     ) -> None:
         """Begin, or take up what is there.
 
@@ -65,11 +74,28 @@ class StoredJournal(Journal):
             run: What a run and its continuation agree in.
             stage: Its name.
             tell: Hears what begins, the share that is done and the seconds left.
+            workers: Processes for what can be done side by side; with fewer than two, this one.
         """
+        self.pool = Pool[Numbered, bytes](workers, timeout=math.inf)
         self.folder, self.run, self._tell = folder, run, tell
         self.after = sha256_bytes(canonical_json([run, stage]).encode())
         self.earlier = 0.0
         """Seconds that steps took which were done before."""
+
+    def __enter__(self) -> StoredJournal:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.pool.__exit__(kind, error, trace)
+
+    def ahead(self, jobs: Sequence[Callable[[], T]]) -> Sequence[Callable[[], T]]:
+        """In the worker processes, where there are several of both."""
+        return ahead(self.pool, jobs) if min(self.pool.size, len(jobs)) > 1 else jobs
 
     def tell(self, words: str, done: float, left: float) -> None:
         """Pass it on."""

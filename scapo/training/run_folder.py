@@ -157,11 +157,13 @@ class RunFolder:
             self._check_same(path, known.run)
         return there
 
-    def journal(self, stage: str, tell: Callable[[str, float, float], None]) -> StoredJournal:
-        """That of a start which begins or goes on."""
+    def journal(
+        self, stage: str, tell: Callable[[str, float, float], None], workers: int = 0
+    ) -> StoredJournal:
+        """That of a start which begins or goes on, with so many worker processes."""
         header = json.loads(canonical_json(self.header(Position(), finished=False)))
         same = {name: header[name] for name in SAME}
-        return StoredJournal(self.path / START, same, stage, tell)
+        return StoredJournal(self.path / START, same, stage, tell, workers)
 
     def load(self, state: State, rank: int = 0) -> tuple[bool, Arrays | None]:
         """Load the method and `state`; whether the run is finished, and the optimiser's part of it.

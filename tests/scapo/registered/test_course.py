@@ -88,7 +88,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         torch.rand(1, generator=rest[-1])
         return OrientationScorer()
 
-    def halved(one: Candidate, g: torch.Generator) -> list[Candidate]:
+    def halved(one: Candidate, g: torch.Generator, _: Journal) -> list[Candidate]:
         made.append("halved")
         return [advancing(copied(one), g) for _ in range(2)]
 
@@ -100,8 +100,9 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         "unexplained": lambda one, *_: float(one.template.pivot.detach().sum()),
         "densified": lambda one, _, g, *more: advancing(copied(one), g),
         "in_halves": halved,
-        "with_axis_deviation": lambda one, *x: advancing(copied(one), *x),
+        "with_axis_deviation": lambda one, _, __, g, ___: advancing(copied(one), g),
         "advance": advancing,
+        "_advance_alone": lambda one, *x: advancing(one, x[-1].generator),
         "search_views": searching,
         "search_near": lambda *x, **y: Hypotheses(
             placement=truth, loss=torch.zeros(16, 1), unlike=torch.zeros(16, 1)

@@ -101,6 +101,7 @@ def test_mirror_images_take_the_first_round_on_half_of_the_views(
         "fitted_proposals": lambda *_: [first],
         "completed": completing,
         "advance": advancing,
+        "_advance_alone": advancing,
         "densified": lambda best, *_: best,
         "search_views": lambda *_: everywhere,
     }.items():

@@ -138,7 +138,7 @@ def test_the_same_views_give_the_same_template_interrupted_or_not(
         patch.setattr(discovery, "densified", interrupted)
         with pytest.raises(InterruptedRunError):
             found(stored())
-    for step in ("common_frame", "fitted_proposals", "advance"):
+    for step in ("common_frame", "fitted_proposals", "advance", "_advance_alone"):
         monkeypatch.setattr(discovery, step, interrupted)  # none of them is done again
     other = found(stored())
     for name, value in one.template.state_dict().items():

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -192,3 +193,51 @@ def test_time_of_steps_that_were_done_before_counts(cut: Path) -> None:
     run(Slow(8), cut, resume=True)
     spent: dict[str, float] = json.loads((cut / "timing.json").read_text())["stage_seconds"]
     assert 3000 < spent["one"] < 3060
+
+
+def drawn(seed: int, path: Path) -> Observation:
+    """What a step makes that needs no other; a file tells that it was done."""
+    path.touch()
+    generator = torch.Generator().manual_seed(seed)
+    return Observation(points=torch.rand(1, 5, 3, generator=generator))
+
+
+class Wide(Line):
+    """A start of steps that may be done side by side."""
+
+    def start(
+        self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> None:
+        del observation, labels
+        jobs = [partial(drawn, seed, self.folder / f"{stage}-{seed}") for seed in range(STEPS)]
+        total = torch.zeros(1, 5, 3)
+        for seed, make in enumerate(self.journal.ahead(jobs)):
+            made = self.journal.once(f"seed {seed}", make, generator, {"Observation": Observation})
+            total = total + made.points * (1 + seed)
+            if seed == self.stop:
+                raise InterruptedRunError
+        self.drawn = total.mean(-1)[0]
+
+    def __init__(self, folder: Path, stop: int = STEPS) -> None:
+        super().__init__()
+        self.folder, self.stop = folder, stop
+        folder.mkdir(exist_ok=True)
+
+
+def test_steps_side_by_side_are_kept_as_those_one_by_one(tmp_path: Path) -> None:
+    """Interrupted after the second of four: two are taken up, whoever made them."""
+    here, there = Wide(tmp_path / "a"), Wide(tmp_path / "b", stop=1)
+    fit.fit(here, tiny_data(), tmp_path / "here", CONFIG)
+    several = replace(CONFIG, workers=2)
+    with pytest.raises(InterruptedRunError):
+        fit.fit(there, tiny_data(), tmp_path / "there", several)
+    assert len(list((tmp_path / "there" / START).iterdir())) == 2
+    again = Wide(tmp_path / "c")
+    fit.fit(again, tiny_data(), tmp_path / "there", several, resume=True)
+    first = again.stages()[0].name
+    assert sorted(path.name for path in again.folder.glob(f"{first}-*")) == [
+        f"{first}-2",
+        f"{first}-3",
+    ]
+    assert torch.equal(here.drawn, again.drawn)
+    same(tmp_path / "here", tmp_path / "there")
