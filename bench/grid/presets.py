@@ -121,7 +121,7 @@ REGISTERED = Entry(
 OBJECTS = replace(REGISTERED, name="registered-objects", seeds=(1,),
                   flags=("--supervision", "instance"))  # fmt: skip
 """Told which training clouds show the same object; trained and scored in the chain of `WARM`."""
-RELEASED = replace(REGISTERED, name="released", seeds=(1,), modes=("quick", "refine"), training=0,
+RELEASED = replace(REGISTERED, name="released", seeds=(1,), training=0,
                    models=("{category}/{part}", "{category}"))  # fmt: skip
 """What users get: the models that come with the package, in the frame that they answer in."""
 BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("refine",),

@@ -2,7 +2,8 @@
 """The course of a discovery: its steps, how long they usually take, and what is kept of them.
 
 `plan_of` knows all steps beforehand, by name and in order. A `Course` tells the journal of the
-training which of them begins and how long the rest will take, and has it keep what each made.
+training which of them begins and how long the rest will take, and has it keep what each made, and
+do those side by side that need nothing of one another.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import torch
 from scapo.categories import CATEGORIES
 from scapo.method import Journal
 from scapo.predictor import load
-from scapo.registered import discovery
+from scapo.registered import base, discovery
 from scapo.registered import method as room
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.discovery import Discovery, discover
@@ -152,33 +152,51 @@ def test_too_few_clouds_are_refused() -> None:
         made.start("votes", clouds(5), Labels(), torch.Generator().manual_seed(0))
 
 
-def test_a_run_begins_at_another_ones_template_and_refuses_what_does_not_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+TOLD = replace(CONFIG, learned=10, placed=10, epochs=1, supervision=("instance",))
+
+
+@pytest.fixture
+def first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainingData:
+    """What a run in `first` was trained on, in place of whose discovery the truth is."""
     _, truth = sighted(10, seed=80)
     none = torch.zeros(10)
     found = SearchResult(placement=truth, loss=none, margin=none)
     made = Discovery(template=template(count=240), found=found, scorer=OrientationScorer())
     monkeypatch.setattr(room, "discover", lambda *_: made)
     data = TrainingData(observation=clouds(10), labels=Labels(), digest="here")
-    told = replace(CONFIG, learned=10, placed=10, epochs=1, supervision=("instance",))
-    fit.fit(method(told), data, tmp_path / "first", RUN)
-
+    fit.fit(method(TOLD), data, tmp_path / "first", RUN)
     monkeypatch.setattr(room, "discover", None)  # it is not found again
-    begun = replace(told, start=str(tmp_path / "first"))
-    fit.fit(method(begun), data, tmp_path / "second", RUN)
-    second = load(tmp_path / "second").model
+    return data
+
+
+def test_clouds_are_placed_by_several_processes_as_by_one(
+    first: TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In both rounds, the second with the network of the first."""
+    monkeypatch.setattr(base, "KEPT", 4)
+    begun = replace(TOLD, start=str(tmp_path / "first"))
+    for workers in (0, 2):
+        config = replace(RUN, workers=workers)
+        fit.fit(method(begun), first, tmp_path / str(workers), config)
+    same(tmp_path / "0", tmp_path / "2")
+
+
+def test_a_run_begins_at_another_ones_template_and_refuses_what_does_not_fit(
+    first: TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = replace(TOLD, start=str(tmp_path / "first"))
+    fit.fit(method(begun), first, tmp_path / "second", RUN)
+    second, other = load(tmp_path / "second").model, load(tmp_path / "first").model
     assert isinstance(second, TemplateRegistration)
-    assert torch.equal(second.template.points, made.template.points)
-    first = load(tmp_path / "first").model
-    assert isinstance(first, TemplateRegistration)
+    assert isinstance(other, TemplateRegistration)
+    assert torch.equal(second.template.points, other.template.points)
     for channels, learned in ((begun.channels, True), (begun.channels // 2, False)):
         another = method(replace(begun, channels=channels))
         monkeypatch.setattr(another, "_place", lambda *_: None)
         another.start("votes", clouds(10), Labels(), torch.Generator())
         assert bool(another.network.learned) == learned  # it places with what it was taught
-        same = another.network.state_dict(), first.network.state_dict()
-        assert all(torch.equal(same[0][name], same[1][name]) for name in same[1]) or not learned
+        weights, known = another.network.state_dict(), other.network.state_dict()
+        assert all(torch.equal(weights[name], known[name]) for name in known) or not learned
     g = torch.Generator()
     with pytest.raises(ValueError, match="was told instance; add --supervision instance"):
         method(replace(begun, supervision=())).start("votes", clouds(10), Labels(), g)
