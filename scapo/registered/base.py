@@ -188,6 +188,7 @@ class AbstractRegistered(AbstractMethod):
             return
         device = self.template.points.device
         self.cpu()
+        self.eval()  # it is asked, and learns nothing yet
         self.targets.clear()
         index = evenly(len(cloud), self.config.placed).to(cloud.device)
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
