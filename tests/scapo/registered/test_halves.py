@@ -15,7 +15,16 @@ from scapo.geometry.rigid import random_rotations
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.registered import halves
 from scapo.registered.bundle_adjustment import Candidate, Inliers
-from scapo.registered.halves import are_halves, cuts, in_halves, may_have_halves, to_the_middle
+from scapo.registered.halves import (
+    PLANES,
+    UNLIKE,
+    are_halves,
+    cuts,
+    in_halves,
+    may_have_halves,
+    to_the_middle,
+    unlikeness,
+)
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.views import observe
 from tests.helpers.sighted import PIVOT, box, sighted, template
@@ -135,6 +144,35 @@ def test_cuts_halve_the_shape_about_the_axis():
         assert max(right, 1 - right) > 0.9
     for number in (3, 4):
         assert made[number].pivot.detach()[0, :2].norm() < 0.05
+
+
+@torch.no_grad()
+def hinged(half: Tensor, *, turn: float) -> ArticulatedTemplate:
+    """Points beside the z axis, and as many turned by an angle about it and mirrored, or not."""
+    other = half * torch.tensor([1.0, -1.0, 1.0]) if turn else half + torch.tensor([0.0, 0.2, 0.0])
+    points = torch.cat([half, other @ rotvec_to_rotmat(turn * UP).T])
+    made = ArticulatedTemplate(("revolute",), len(points))
+    part = (torch.arange(len(points)) >= len(half)).long()
+    made.assign(points, F.normalize(points, dim=-1), 6.0 * F.one_hot(part, 2))
+    made.axis.copy_(UP[None])
+    made.pivot.zero_()
+    return made
+
+
+def test_halves_are_mirror_images_and_a_door_with_a_ceiling_is_none():
+    """At a turn between two of the planes that are tried; against distances to the true image."""
+    half = torch.rand(200, 3, generator=generator(4)) * torch.tensor([0.4, 0.1, 0.3])
+    assert unlikeness(hinged(half, turn=2.0)) < 0.4 * torch.pi / PLANES
+    assert are_halves(hinged(half, turn=2.0))
+    walls = torch.rand(200, 3, generator=generator(5)) * torch.tensor([0.4, 0.4, 0.3])
+    walls[:100, 0], walls[100:, 1] = 0.4, 0.0
+    shifted = hinged(walls, turn=0.0)  # as many points, elsewhere
+    assert unlikeness(shifted) > UNLIKE
+    assert not are_halves(shifted)
+    image = walls[:, [1, 0, 2]] + torch.tensor([0.2, 0.0, 0.0])  # in the plane between x and y
+    apart = torch.cdist(walls, image)
+    best = float(apart.amin(0).mean() + apart.amin(1).mean()) / 2
+    assert unlikeness(shifted) <= best + 1e-6
 
 
 @pytest.mark.parametrize(
