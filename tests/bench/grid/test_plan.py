@@ -96,7 +96,7 @@ def test_a_released_model_is_asked_by_its_name(tmp_path: Path, monkeypatch):
     for chain, name in zip(first, ("oven", "laptop/sensor"), strict=True):
         asked = [step for step in chain.steps if step.kind == "predict"]
         assert {step.name for step in asked} == {
-            f"predict-{mode}-{split}" for mode in ("quick", "refine")
+            f"predict-{mode}-{split}" for mode in ("fast", "quick", "refine")
             for split in ("test", "test-ood")
         }  # fmt: skip
         assert all(step.command[1] == name and not step.needs for step in asked)
