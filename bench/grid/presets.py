@@ -115,7 +115,7 @@ REGISTERED = Entry(
     seeds=THREE,
     parts=("clean", "sensor"),
     modes=("fast", "quick", "refine"),
-    training=1200,
+    training=2500,
     seconds={"fast": 0.05, "quick": 0.06, "refine": 0.35},
 )
 OBJECTS = replace(REGISTERED, name="registered-objects", seeds=(1,),

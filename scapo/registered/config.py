@@ -156,7 +156,7 @@ class RegisteredConfig(SearchConfig):
 
 
 def cpu_config() -> RegisteredConfig:
-    """Trains one category in at most 20 minutes on two cores."""
+    """Trains one category in 22 minutes on two cores."""
     return RegisteredConfig()
 
 

@@ -54,7 +54,7 @@ def test_a_warm_start_has_a_run_of_its_own_to_begin_at(cpu: Plan):
     config = cpu.configs["scapo-warm"]
     assert config["config"]["part_start"] == "run"
     assert config["start"]["method"] == "registered"
-    assert cpu.seconds[chain.name, first.name] == 1200
+    assert cpu.seconds[chain.name, first.name] == 2500
     run = Path(first.output).parent.name
     told = [s for s in chain.steps if s.name.endswith("-start") and s.kind == "predict"]
     assert {s.command[1].rpartition("/")[2] for s in told} == {run}
