@@ -115,7 +115,10 @@ def test_a_budget_bounds_the_epochs():
         seconds = training_seconds(entry, flags, 5000)
         least = sum(5000 / rate for rate in entry.rates)  # one epoch of each stage
         assert seconds is not None
-        assert seconds <= max(20 * 60, least), entry.label
+        if entry.rates:  # template registration has no such epochs, and takes what it takes
+            assert seconds <= max(20 * 60, least), entry.label
+        else:
+            assert seconds == entry.training
 
 
 def test_real_objects_are_shown_to_one_model_of_each_method(tmp_path: Path):
