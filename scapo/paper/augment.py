@@ -49,3 +49,28 @@ def disturb(
     distance = (points - centre).square().sum(-1)
     kept = distance.topk(number - min(100, number // 10), dim=1).indices
     return gather(points, kept.sort(1).values)
+
+
+CELLS, WIDTH, BEHIND = 10, 1.2, 0.06
+"""Of a camera's image along either side, its width, and how far behind what a cell shows a point
+is hidden; normalised lengths. A shape of a few hundred points has some in every cell."""
+
+
+@torch.no_grad()
+def one_side(
+    points: Float[Tensor, "B N 3"], count: int, generator: torch.Generator
+) -> Float[Tensor, "B {count} 3"]:
+    """So many of the points that a camera far away sees, in a random direction for each cloud.
+
+    They are drawn with replacement and stay where they are.
+    """
+    batch, _, _ = points.shape
+    turn = random_rotations(batch, generator, dtype=points.dtype)
+    seen = points @ turn.mT
+    cell = ((seen[..., :2] / WIDTH + 0.5) * CELLS).floor().clamp(0, CELLS - 1).long()
+    index = cell[..., 0] * CELLS + cell[..., 1]
+    depth = seen[..., 2]
+    nearest = torch.full((batch, CELLS**2), torch.inf, dtype=points.dtype, device=points.device)
+    nearest = nearest.scatter_reduce(1, index, depth, "amin")
+    shown = depth <= nearest.gather(1, index) + BEHIND
+    return gather(points, torch.multinomial(shown.float(), count, True, generator=generator))

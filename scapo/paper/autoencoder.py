@@ -7,19 +7,20 @@ it; sizes are docs/method.md's. All lengths are in normalised units (mean radius
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.geometry.numerics import exact
-from scapo.geometry.points import gather
+from scapo.geometry.points import chamfer, gather
 from scapo.geometry.rigid import project_rotation
 from scapo.paper.vector_neurons import (
+    TINY,
     EdgeForm,
     NormForm,
     VNBlock,
@@ -30,6 +31,7 @@ from scapo.paper.vector_neurons import (
 )
 
 Projection = Literal["svd", "gram-schmidt"]
+PoseForm = Literal["pooled", "votes"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +53,12 @@ class EncoderConfig:
     edge: EdgeForm = "point"
     norm: NormForm = "scale"
     projection: Projection = "svd"
+    pose: PoseForm = "pooled"
+    """R_g from pooled vectors, or from where every centre says that it lies in the aligned frame
+    (not in the paper)."""
+    hypotheses: int = 1
+    """Rotations of a cloud, of which the one counts that brings it nearest to S_dec (as OP-Align
+    chooses among 60; the paper has one)."""
 
     @property
     def code(self) -> int:
@@ -70,6 +78,36 @@ class Encoding:
     """t_g, the aligned origin in the input frame."""
     code: Float[Tensor, "B Z"]
     """Z_x, invariant to rigid motions."""
+    frames: Float[Tensor, "B H 3 3"] | None = None
+    """Of all hypotheses, raw; None where there is one."""
+    chosen: Int[Tensor, " B"] | None = None
+    """Which of them `frame` and `rotation` are."""
+
+    def nearest(
+        self, points: Float[Tensor, "B N 3"], shape: Float[Tensor, "B M 3"], config: EncoderConfig
+    ) -> Encoding:
+        """By the hypothesis that brings the points nearest to a shape in the aligned frame."""
+        if self.frames is None:
+            return self
+        with torch.no_grad():
+            turns = project(self.frames, config).unbind(1)
+            off = [chamfer(replace(self, rotation=turn).align(points), shape) for turn in turns]
+        return self.by(torch.stack(off, 1).argmin(1), config)
+
+    def facing(self, rotation: Float[Tensor, "B 3 3"], config: EncoderConfig) -> Encoding:
+        """By the hypothesis that is nearest to a rotation."""
+        if self.frames is None:
+            return self
+        with torch.no_grad():
+            near = (project(self.frames, config) * rotation[:, None]).sum((-1, -2))
+        return self.by(near.argmax(1), config)
+
+    def by(self, chosen: Int[Tensor, " B"] | None, config: EncoderConfig) -> Encoding:
+        """By the hypotheses of those numbers."""
+        if self.frames is None or chosen is None:
+            return self
+        frame = self.frames[torch.arange(len(chosen), device=chosen.device), chosen]
+        return replace(self, frame=frame, rotation=project(frame, config), chosen=chosen)
 
     def align(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
         """S_obj = (X - 1 t_g^T) R_g^T in the paper's letters: input to aligned frame."""
@@ -78,6 +116,12 @@ class Encoding:
     def place(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
         """X = S R_g + 1 t_g^T in the paper's letters: aligned to input frame."""
         return points @ self.rotation.mT + self.translation[:, None]
+
+
+def project(frame: Float[Tensor, "*B 3 3"], config: EncoderConfig) -> Float[Tensor, "*B 3 3"]:
+    """The rotation that is used wherever one is needed; `frame` itself feeds L_ortho alone."""
+    with exact(frame.device.type):
+        return project_rotation(frame) if config.projection == "svd" else gram_schmidt(frame)
 
 
 def gram_schmidt(frame: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
@@ -107,7 +151,11 @@ class Encoder(nn.Module):
         )
         self.mix = block(2 * width, 2 * width)
         self.widen = block(2 * width, config.features)
-        self.pose = VNLinear(config.features, 3)
+        self.pose = (
+            VNLinear(config.features, 3 * config.hypotheses)
+            if config.pose == "pooled"
+            else nn.Linear(config.code, 3 * config.hypotheses)
+        )
         self.frame = nn.Sequential(
             block(2 * config.features, config.features),
             block(config.features, config.features // 2),
@@ -119,25 +167,56 @@ class Encoder(nn.Module):
         # VNT layers carry the centroid b along; taking it out first and adding it to t_g is the
         # same map, and spares float32 the cancellation.
         middle = points.mean(1, keepdim=True)
-        point = self.local_features(points - middle)  # (B, M, 3, width)
+        points = points - middle
+        centres = self.centres(points)
+        point = self.local_features(points, centres)  # (B, M, 3, width)
         origin = self.centre(point)  # (B, M, 3, 1)
         translation = origin.mean(1)[..., 0] + middle[:, 0]
         feature = self.shape_features(point - origin)  # (B, M, 3, features)
         pooled = feature.mean(1)  # (B, 3, features)
-        frame = self.pose(pooled)
+        invariants = self.invariants(feature, pooled)
+        frames = self.frames(pooled, invariants, centres)
         return Encoding(
-            frame=frame,
-            rotation=self.project(frame),
+            frame=frames[:, 0],
+            rotation=project(frames[:, 0], self.config),
             translation=translation,
-            code=self.invariants(feature, pooled).amax(1),
+            code=invariants.amax(1),
+            frames=frames if self.config.hypotheses > 1 else None,
         )
 
-    def local_features(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B M 3 C"]:
+    def centres(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B M 3"]:
+        """Points that carry features."""
+        config = self.config
+        if config.centres is None or config.centres >= points.shape[1]:
+            return points
+        return gather(points, spread_centres(points, config.centres, config.pool))
+
+    def frames(
+        self,
+        pooled: Float[Tensor, "B 3 C"],
+        invariants: Float[Tensor, "B M Z"],
+        centres: Float[Tensor, "B M 3"],
+    ) -> Float[Tensor, "B H 3 3"]:
+        """Raw frames: vectors of the whole cloud, or what the votes of its centres agree on.
+
+        A centre votes where it lies; the covariance of places and votes is the frame, over the root
+        of their mean squares, so that a rotation of unit length is what agreement gives.
+        """
+        if self.config.pose == "pooled":
+            return self.pose(pooled).unflatten(-1, (-1, 3)).transpose(1, 2)
+        votes = self.pose(invariants).unflatten(-1, (-1, 3)).transpose(1, 2)  # (B, H, M, 3)
+        votes = votes - votes.mean(2, keepdim=True)
+        places = (centres - centres.mean(1, keepdim=True))[:, None]
+        size = votes.square().mean((2, 3), keepdim=True) * places.square().mean(
+            (2, 3), keepdim=True
+        )
+        return places.mT @ votes / (places.shape[2] * (size + TINY).sqrt())
+
+    def local_features(
+        self, points: Float[Tensor, "B N 3"], centres: Float[Tensor, "B M 3"]
+    ) -> Float[Tensor, "B M 3 C"]:
         """Mean over the edges of each centre; translations pass through (VNT)."""
-        config, centres = self.config, points
-        if config.centres is not None and config.centres < points.shape[1]:
-            centres = gather(points, spread_centres(points, config.centres, config.pool))
-        edges = edge_vectors(points, centres, config.neighbours, config.edge)
+        edges = edge_vectors(points, centres, self.config.neighbours, self.config.edge)
         return self.edge(edges).mean(2)
 
     def shape_features(self, point: Float[Tensor, "B M 3 W"]) -> Float[Tensor, "B M 3 C"]:
@@ -154,12 +233,6 @@ class Encoder(nn.Module):
         both = torch.cat([feature, pooled[:, None].expand_as(feature)], -1)  # (B, M, 3, 2C)
         frame = self.frame(both)  # (B, M, 3, 3)
         return (both.mT @ frame).flatten(-2)
-
-    def project(self, frame: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
-        """The rotation that is used wherever one is needed; `frame` itself feeds L_ortho alone."""
-        with exact(frame.device.type):
-            svd = self.config.projection == "svd"
-            return project_rotation(frame) if svd else gram_schmidt(frame)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -182,7 +182,7 @@ class Scapo(AbstractMethod):
         self.eval()
         clouds = normalise(observation.points[chosen])[0]
         count = config.points or clouds.shape[1]
-        seen = cat([self.encoder(thin(some, count)) for some in clouds.split(64)])
+        seen = cat([self._decoded(thin(some, count))[0] for some in clouds.split(64)])
         medoid = int(torch.cdist(seen.code, seen.code).sum(1).argmin())
         shape = self.decoder(seen.code[medoid, None])[0][0]
         keypoints = part_centroids(shape, len(self.category.parts))
@@ -253,10 +253,17 @@ class Scapo(AbstractMethod):
             self.config.search.teaching,
         )
 
+    def _decoded(
+        self, points: Float[Tensor, "B N 3"]
+    ) -> tuple[Encoding, Float[Tensor, "B M 3"], Float[Tensor, "B M C"]]:
+        """A cloud's encoding by the pose that explains it best, S_dec and F_x."""
+        encoding = self.encoder(points)
+        shape, features = self.decoder(encoding.code)
+        return encoding.nearest(points, shape, self.config.encoder), shape, features
+
     def explain(self, points: Float[Tensor, "B N 3"]) -> Explanation:
         """Run every network on clouds in the input frame."""
-        encoding = self.encoder(thin(points, self.config.points or points.shape[1]))
-        _, features = self.decoder(encoding.code)
+        encoding, _, features = self._decoded(thin(points, self.config.points or points.shape[1]))
         aligned = encoding.align(points)
         residual = self.residual_network(features)
         template = self.template.points + residual
@@ -289,9 +296,8 @@ class Scapo(AbstractMethod):
         points = apply(pose, points)
         if step.stage == CANONICALISE:
             if self.config.part_start == "run":
-                encoding = self.encoder(points)
+                encoding, shape, _ = self._decoded(points)
                 told = self._warm().read(observation, step.index, encoding, pose)
-                shape, _ = self.decoder(encoding.code)
                 return imitation(encoding, shape, told, self.kinds, config)
             return canonicalisation(self.encoder, self.decoder, points, config, step.generator)
         self._freeze(step)

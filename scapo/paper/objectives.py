@@ -14,7 +14,7 @@ from torch import Tensor
 from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, invert, random_rotations
 from scapo.paper import losses
-from scapo.paper.augment import DISTURBANCES, Disturbance, disturb
+from scapo.paper.augment import DISTURBANCES, Disturbance, disturb, one_side
 from scapo.paper.autoencoder import Decoder, Encoder, Encoding
 from scapo.paper.heads import JointPairs
 from scapo.paper.skinning import (
@@ -40,6 +40,8 @@ class LossConfig:
     ortho: float = 0.1
     aug: float = 0.1
     can: float = 0.1
+    views: float = 0.0
+    """As L_can_consist, of S_dec as two cameras see it, a side each. Not in the paper."""
     cycle: float = 10.0
     """Of the cloud and, with the same weight, of the template."""
     recon: float = 10.0
@@ -107,6 +109,7 @@ def canonicalisation(
     """Stage 1 (Sec. 3.1): L = L_rec + l1 L_ortho + l2 L_aug_consist + l3 L_can_consist."""
     encoding = encoder(points)
     shape, _ = decoder(encoding.code)  # S_dec (B, N, 3)
+    encoding = encoding.nearest(points, shape, encoder.config)
 
     def rec() -> Tensor:
         # In the aligned frame: the distance is the same, and so is VNT's second term.
@@ -116,13 +119,15 @@ def canonicalisation(
         chosen = _draw(config, generator)
         others = [encoder(disturb(points, kind, generator)) for kind in chosen]
         share = len(config.disturbances) / len(chosen)
-        return share * torch.stack([_agree(other, encoding) for other in others]).sum()
+        same = [other.by(encoding.chosen, encoder.config) for other in others]
+        return share * sum_of(_agree(other, encoding) for other in same)
 
     def can() -> Tensor:
-        turn = random_rotations(points.shape[0], generator, dtype=points.dtype)
-        again = encoder(shape.detach() @ turn.mT)
-        zero = torch.zeros_like(again.translation)
-        return losses.pose_agreement(again.rotation, again.translation, turn, zero)
+        return _recovered(encoder, shape.detach(), generator)
+
+    def views() -> Tensor:
+        sides = [one_side(shape.detach(), points.shape[1], generator) for _ in range(2)]
+        return sum_of(_recovered(encoder, side, generator) for side in sides) / 2
 
     reconstructed = rec()
     terms: dict[str, Callable[[], Tensor]] = {
@@ -131,8 +136,19 @@ def canonicalisation(
         "ortho": lambda: losses.orthonormality(encoding.frame),
         "aug": aug,
         "can": can,
+        "views": views,
     }
     return weigh(terms, config)
+
+
+def _recovered(
+    encoder: Encoder, shape: Float[Tensor, "B N 3"], generator: torch.Generator
+) -> Tensor:
+    """How far the pose is missed of points in the aligned frame that are turned at random."""
+    turn = random_rotations(shape.shape[0], generator, dtype=shape.dtype)
+    again = encoder(shape @ turn.mT).facing(turn, encoder.config)
+    zero = torch.zeros_like(again.translation)
+    return losses.pose_agreement(again.rotation, again.translation, turn, zero)
 
 
 def _agree(other: Encoding, encoding: Encoding) -> Tensor:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from scapo.paper.augment import DISTURBANCES, Disturbance, disturb, random_pose
+from scapo.paper.augment import DISTURBANCES, Disturbance, disturb, one_side, random_pose
 from tests.helpers.strategies import generator, is_rotation, normal
 
 POINTS = normal(0, 3, 600, 3, dtype=torch.float32)
@@ -57,3 +57,27 @@ def test_a_crop_removes_a_ball_and_keeps_the_order() -> None:
     outside = torch.cdist(removed, found).amin(-1)
     assert_close(outside.min() > 0, torch.tensor(True))
     assert spread < torch.cdist(found, found).amax(-1).amin()
+
+
+def test_a_camera_far_away_sees_one_half_of_a_ball_and_its_own_points() -> None:
+    ball = torch.nn.functional.normalize(normal(0, 20, 4000, 3, dtype=torch.float32), dim=-1) / 4
+    found = one_side(ball, 500, generator(1))
+    assert found.shape == (20, 500, 3)
+    assert torch.cdist(found, ball, compute_mode="donot_use_mm_for_euclid_dist").amin(-1).max() == 0
+    middle = torch.nn.functional.normalize(found.mean(1), dim=-1)
+    along = (found @ middle[..., None])[..., 0]
+    assert (along > -0.08).float().mean() > 0.98  # a cell is seen a little past the edge
+    assert along.quantile(0.5, dim=1).min() > 0.08
+    assert middle.mean(0).norm() < 0.6  # from a direction of its own each
+
+
+def test_what_is_behind_a_wall_is_not_seen() -> None:
+    side = torch.linspace(-0.3, 0.3, 30)
+    wall = torch.cartesian_prod(side, side)
+    two = torch.cat([torch.nn.functional.pad(wall, (0, 1), value=z) for z in (-0.08, 0.08)])
+    found = one_side(two.expand(40, -1, -1), 400, generator(1))
+    front = (found[..., 2] > 0).float().mean(1)
+    facing = torch.maximum(front, 1 - front)
+    assert (facing > 0.75).float().mean() > 0.5
+    assert bool((front < 0.15).any())
+    assert bool((front > 0.85).any())

@@ -11,7 +11,15 @@ from torch import nn
 from torch.testing import assert_close
 
 from scapo.first_weights import initialise
-from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig, gram_schmidt
+from scapo.geometry.rigid import rotation_angle
+from scapo.paper.autoencoder import (
+    Decoder,
+    DecoderConfig,
+    Encoder,
+    EncoderConfig,
+    gram_schmidt,
+    project,
+)
 from tests.helpers.strategies import generator, is_rotation, normal, rotations
 
 SMALL = EncoderConfig(neighbours=8, centres=24, pool=60, width=6, branch=(8, 12, 8, 6), features=7)
@@ -21,6 +29,9 @@ FORMS = {
     "mean edges": replace(SMALL, edge="mean"),
     "gram-schmidt": replace(SMALL, projection="gram-schmidt"),
     "length norm": replace(SMALL, norm="length"),
+    "votes": replace(SMALL, pose="votes"),
+    "hypotheses": replace(SMALL, hypotheses=4),
+    "hypotheses by votes": replace(SMALL, pose="votes", hypotheses=4),
 }
 
 
@@ -91,6 +102,43 @@ def test_gram_schmidt_keeps_the_first_axis() -> None:
     assert bool(is_rotation(found, 1e-12).all())
     first = frame[..., 0] / frame[..., 0].norm(dim=-1, keepdim=True)
     assert_close(found[..., 0], first)
+
+
+@pytest.mark.parametrize("name", ["hypotheses", "hypotheses by votes"])
+def test_of_the_hypotheses_the_one_counts_that_explains_a_cloud_best(name: str) -> None:
+    config, points = FORMS[name], 0.2 * normal(9, 3, 60, 3)
+    encoding = encoder(config).double()(points)
+    assert encoding.frames is not None
+    turns = project(encoding.frames, config)
+    some, others = (turns[:, row, :] for row in ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3]))
+    apart = rotation_angle(some, others)
+    assert apart.amax(1).min() > 0.1  # they differ
+    wanted = torch.tensor([2, 0, 3])
+    shape = encoding.by(wanted, config).align(points)
+    for found in (
+        encoding.nearest(points, shape, config),
+        encoding.facing(turns[[0, 1, 2], wanted], config),
+    ):
+        assert found.chosen is not None
+        assert found.chosen.tolist() == wanted.tolist()
+        assert_close(found.rotation, turns[[0, 1, 2], wanted])
+        assert_close(found.frame, encoding.frames[[0, 1, 2], wanted])
+
+
+def test_one_hypothesis_is_never_exchanged() -> None:
+    points = 0.2 * normal(9, 3, 60, 3)
+    encoding = encoder(SMALL).double()(points)
+    assert encoding.nearest(points, points.flip(0), SMALL) is encoding
+    assert encoding.facing(rotations(1, 3), SMALL) is encoding
+    assert encoding.by(None, SMALL) is encoding
+
+
+def test_votes_that_are_the_points_themselves_give_the_rotation_between_them() -> None:
+    made, points = encoder(FORMS["votes"]).double(), 0.2 * normal(9, 3, 60, 3)
+    turn = rotations(2, 3)
+    made.pose = nn.Identity()  # votes are what it is given
+    frames = made.frames(points.mT, points, points @ turn.mT)
+    assert_close(project(frames[:, 0], SMALL), turn)
 
 
 def test_sizes_are_the_published_ones_within_three_percent() -> None:

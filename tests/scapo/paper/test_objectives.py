@@ -12,20 +12,22 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.categories import JointKind
+from scapo.first_weights import initialise
 from scapo.geometry.rigid import apply, joint_motion
-from scapo.paper.autoencoder import Encoding
+from scapo.paper.autoencoder import Decoder, DecoderConfig, Encoder, EncoderConfig, Encoding
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import (
     AblatedTerm,
     Explanation,
     LossConfig,
     articulation,
+    canonicalisation,
     deform_all,
     sum_of,
     weigh,
 )
 from scapo.paper.skinning import Bones
-from tests.helpers.strategies import normal
+from tests.helpers.strategies import generator, normal
 
 BASE = {"cycle", "cycle_template", "recon", "recon_template", "kp_seg", "seg", "base_gap"}
 
@@ -118,6 +120,29 @@ def test_weights_are_the_papers() -> None:
         assert_close(weighted[name], factor * plain[name])
     stage_1 = (config.rec, config.rec_aligned, config.ortho, config.aug, config.can)
     assert stage_1 == (1.0, 0.1, 0.1, 0.1, 0.1)
+
+
+@pytest.mark.parametrize("hypotheses", [1, 3])
+def test_a_pose_that_views_of_the_shape_do_not_give_back_costs(hypotheses: int) -> None:
+    config = EncoderConfig(
+        neighbours=8, centres=24, pool=60, width=6, branch=(8, 12, 8, 6), features=7,
+        hypotheses=hypotheses,
+    )  # fmt: skip
+    encoder, decoder = (
+        Encoder(config),
+        Decoder(DecoderConfig(patches=2, points=64, widths=(8, 8, 8)), config.code),
+    )
+    for network in (encoder, decoder):
+        initialise(network, generator(0))
+    points = 0.2 * normal(1, 4, 60, 3, dtype=torch.float32)
+    chosen = LossConfig(views=2.0, disturbances=("noise",))
+    terms = canonicalisation(encoder, decoder, points, chosen, generator(1))
+    assert set(terms) == {"rec", "rec_aligned", "ortho", "aug", "can", "views"}
+    assert 0.2 < terms["views"].item() < 5  # 1 - cos of what is not learned, twice
+    terms["views"].backward()
+    assert all(p.grad is None for p in decoder.parameters())  # the shape is what it is
+    assert encoder.edge.feature.weight.grad is not None
+    assert encoder.edge.feature.weight.grad.abs().sum() > 0
 
 
 def test_terms_of_weight_zero_are_not_computed() -> None:
