@@ -41,6 +41,9 @@ class ScapoConfig:
     """Used with `part_start` search; `spread` and `teaching` with run too."""
     start: str | None = None
     """Run folder of a trained `registered` of the same category, for `part_start` run."""
+    told_of: Literal["views", "surfaces"] = "views"
+    """What the clouds show: one side of an object, as that run's clouds do, or the whole of it,
+    which it is then shown from many sides (0.25 s each)."""
     told: int = 2000
     """Training clouds that this run is asked for, about 0.06 s each on one core."""
     bones_turn: bool = False

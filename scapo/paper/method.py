@@ -215,7 +215,7 @@ class Scapo(AbstractMethod):
                     f"supervision: expected what {self.config.start} was told, {hidden}, "
                     f"found it left out; add --supervision {hidden}"
                 )
-            self._run = WarmStart(run)
+            self._run = WarmStart(run, surfaces=self.config.told_of == "surfaces")
         return self._run
 
     def _searched(self, aligned: Float[Tensor, "B N 3"], medoid: int) -> tuple[Skeleton, Lying]:

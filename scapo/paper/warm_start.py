@@ -28,6 +28,8 @@ from scapo.paper.first_targets import Lying
 from scapo.paper.objectives import LossConfig
 from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
 from scapo.records import cat, map_tensors, take
+from scapo.registered.base import AbstractRegistered
+from scapo.registered.surfaces import lying
 from scapo.types import Observation
 
 POINTS = 1024
@@ -59,17 +61,41 @@ class Told:
         return shape
 
     def exchanged(self, exchange: Exchange) -> Told:
-        """The same surfaces in the same places, told as if base and child were each other.
+        """The same surfaces in the same places, told as if two parts were each other.
 
-        The new base is the old child seen through the half turn about the cloud's own pivot, which
-        reverses the axis; so the motion of the old base against the old child has the old state.
+        Of one hinge base and child: the new base is the old child seen through the half turn about
+        the cloud's own pivot, which reverses the axis; so the motion of the old base against the
+        old child has the old state. Of two hinges the children: the half turn is about the middle
+        of the base.
         """
+        if self.state.shape[1] == 2:
+            return self._with_children_exchanged(exchange)
         turn, pivot, state = exchange.turn, self.pivot[:, 0], self.state[:, 0]
         motion = joint_motion(pivot, self.axis[:, 0], state, "revolute")
         child = rigid(self.rotation, self.translation) @ motion
         pose = child @ rigid(turn.expand_as(self.rotation), pivot - pivot @ turn.mT)
         back = (self.shape[:, exchange.order] - self.pivot) @ turn + self.pivot
         return replace(self, rotation=pose[:, :3, :3], translation=pose[:, :3, 3], shape=back)
+
+    def _with_children_exchanged(self, exchange: Exchange) -> Told:
+        turn, middle = exchange.turn, self.middle()[:, None]
+        axis = self.axis.flip(1) @ turn
+        sign = (axis * self.axis.mean(0)).sum((0, 2)).sign()  # as each joint counts in the mean
+        away = (self.rotation @ (middle - middle @ turn.mT).mT)[..., 0]
+        return replace(
+            self,
+            rotation=self.rotation @ turn,
+            translation=self.translation + away,
+            shape=(self.shape[:, exchange.order] - middle) @ turn + middle,
+            pivot=(self.pivot.flip(1) - middle) @ turn + middle,
+            axis=axis * sign[:, None],
+            state=self.state.flip(1) * sign,
+        )
+
+    def middle(self) -> Float[Tensor, "B 3"]:
+        """Of the base, base frame."""
+        base = (self.part == 0).to(self.shape)[..., None]
+        return (base * self.shape).sum(1) / base.sum(1).clamp_min(1)
 
     def nearer(self, other: Told, encoding: Encoding) -> Told:
         """Of two readings of each cloud the one whose frame is nearer to the encoder's."""
@@ -124,39 +150,67 @@ class Told:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Exchange:
-    """How base and child of a hinge may change places, as the two plates of a laptop."""
+    """How two parts may change places: the two plates of a laptop, the temples of glasses."""
 
     turn: Float[Tensor, "3 3"]
-    """Half a turn about an axis across the hinge, base frame with the states 0."""
+    """Half a turn, base frame with the states 0: of one hinge about an axis across it."""
     order: Int[Tensor, " M"]
-    """For each point of a shape, which of the other part comes to lie nearest to it."""
+    """For each point of a shape, which comes to lie nearest to it that takes its part's place."""
 
     @staticmethod
     def of(told: Told) -> Exchange:
         """The half turn that lays the parts of the mean shape upon each other best."""
-        shape, pivot = told.shape.mean(0), told.pivot.mean((0, 1))
-        axis = F.normalize(told.axis.mean((0, 1)), dim=0)
-        first = F.normalize(shape[told.part[0] == 1].mean(0) - pivot, dim=0)
-        first = F.normalize(first - (first @ axis) * axis, dim=0)
-        angle = torch.arange(0, torch.pi, torch.pi / HALF_TURNS).to(shape)[:, None]
-        across = angle.cos() * first + angle.sin() * torch.linalg.cross(axis, first)
-        turns = 2 * across[:, :, None] * across[:, None] - torch.eye(3).to(shape)
+        shape, part = told.shape.mean(0), told.part[0]
+        two = told.state.shape[1] == 2
+        centre = told.middle().mean(0) if two else told.pivot.mean((0, 1))
+        becomes = torch.tensor([0, 2, 1] if two else [1, 0]).to(part)[part]
 
         def gap(turn: Tensor, some: slice) -> Float[Tensor, "M M"]:
-            laid = (shape - pivot) @ turn.mT + pivot
-            part = told.part[0, some]
-            return torch.cdist(shape[some], laid[some]) + APART * (part[:, None] == part)
+            laid = (shape - centre) @ turn.mT + centre
+            strange = part[some, None] != becomes[some]
+            return torch.cdist(shape[some], laid[some]) + APART * strange
 
-        thin = slice(None, None, 4)
-        costs = [gap(turn, thin).amin(1).mean() + gap(turn, thin).amin(0).mean() for turn in turns]
-        best = turns[int(torch.stack(costs).argmin())]
-        return Exchange(turn=best, order=gap(best, slice(None)).argmin(1))
+        def best(across: Tensor) -> tuple[Tensor, Tensor]:
+            turns = 2 * across[:, :, None] * across[:, None] - torch.eye(3).to(shape)
+            thin = slice(None, None, 4)
+            gaps = [gap(turn, thin) for turn in turns]
+            chosen = int(torch.stack([g.amin(1).mean() + g.amin(0).mean() for g in gaps]).argmin())
+            return across[chosen], turns[chosen]
+
+        if two:
+            rough, _ = best(_hemisphere(HALF_TURNS**2 // 36).to(shape))
+            near = _hemisphere(HALF_TURNS).to(shape) * NEAR
+            _, turn = best(F.normalize(rough + torch.cat([near, -near]), dim=-1))
+        else:
+            _, turn = best(_across(told, shape, centre))
+        return Exchange(turn=turn, order=gap(turn, slice(None)).argmin(1))
 
 
 HALF_TURNS = 120
 """Axes that are tried."""
+NEAR = 0.1
+"""Of axes in all directions: how far those that are tried next lie from the best."""
 APART = 10.0
 """Length that is added between points of which none is to be laid upon the other."""
+
+
+def _across(
+    told: Told, shape: Float[Tensor, "M 3"], pivot: Float[Tensor, " 3"]
+) -> Float[Tensor, "A 3"]:
+    """Directions across the one hinge."""
+    axis = F.normalize(told.axis.mean((0, 1)), dim=0)
+    first = F.normalize(shape[told.part[0] == 1].mean(0) - pivot, dim=0)
+    first = F.normalize(first - (first @ axis) * axis, dim=0)
+    angle = torch.arange(0, torch.pi, torch.pi / HALF_TURNS).to(shape)[:, None]
+    return angle.cos() * first + angle.sin() * torch.linalg.cross(axis, first)
+
+
+def _hemisphere(count: int) -> Float[Tensor, "{count} 3"]:
+    """Directions spread over half a sphere (Fibonacci's)."""
+    number = torch.arange(count) + 0.5
+    height, angle = number / count, torch.pi * (1 + 5**0.5) * number
+    radius = (1 - height.square()).sqrt()
+    return torch.stack([angle.cos() * radius, angle.sin() * radius, height], 1)
 
 
 def frame_errors(encoding: Encoding, told: Told) -> Float[Tensor, " B"]:
@@ -168,18 +222,29 @@ def frame_errors(encoding: Encoding, told: Told) -> Float[Tensor, " B"]:
 class WarmStart:
     """A trained method that is asked for each training cloud once, where it is first needed.
 
-    Where a symmetry of the category exchanges the two parts, the method cannot tell which is which
+    Where a symmetry of the category exchanges two parts, the method cannot tell which is which
     (nor does the evaluation ask): each cloud then has two readings, and of these the one nearer to
     what the encoder says is learned.
     """
 
-    def __init__(self, method: AbstractMethod, mode: Mode = "quick") -> None:
-        """A method whose predictions have canonical points with parts, in one order for all."""
+    def __init__(
+        self, method: AbstractMethod, mode: Mode = "quick", *, surfaces: bool = False
+    ) -> None:
+        """A method whose predictions have canonical points with parts, in one order for all.
+
+        Args:
+            method: Trained.
+            mode: In which it is asked.
+            surfaces: Clouds are whole surfaces, on which its template is laid
+                (`registered.surfaces`); it is a `registered` then.
+        """
         self.method = method
         self.mode: Mode = mode
+        self.surfaces = surfaces
         self.known: dict[int, Told] = {}
         kinds = [joint.kind for joint in method.category.joints]
-        self.two_readings = method.category.symmetry is not None and kinds == ["revolute"]
+        hinges = kinds in (["revolute"], ["revolute"] * 2)
+        self.two_readings = method.category.symmetry is not None and hinges
         self.exchange: Exchange | None = None
 
     def read(
@@ -225,6 +290,8 @@ class WarmStart:
 
     @torch.no_grad()
     def _ask(self, observation: Observation) -> Told:
+        if self.surfaces:
+            return self._laid(observation)
         said = self.method.predict(observation, self.mode)
         pose, joints = said.camera_T_part, said.joints
         shape, part = said.canonical_points, said.canonical_part
@@ -241,6 +308,24 @@ class WarmStart:
             pivot=apply(invert(base), joints.pivot) * scale[..., None],
             axis=joints.axis @ base[:, :3, :3],
             state=torch.where(slide, joints.state * scale, joints.state),
+        )
+
+    def _laid(self, observation: Observation) -> Told:
+        """As the run's template lies in whole surfaces."""
+        if not isinstance(self.method, AbstractRegistered):
+            raise ValueError(f"{self.method.name}: expected a template, found a run without one")
+        template, (points, _) = self.method.template, normalise(observation.points)
+        at, _ = lying(self.method, points)
+        part, size = template.logit.argmax(-1)[:POINTS], at.log_scale.exp()[:, None]
+        child = F.one_hot(part, at.state.shape[1] + 1)[:, 1:].to(size)
+        return Told(
+            rotation=at.rotation,
+            translation=at.translation,
+            shape=template.points[:POINTS] * size + child @ at.shift,
+            part=part.expand(len(points), -1),
+            pivot=template.pivot * size + at.shift,
+            axis=template.directions().expand(len(points), -1, -1),
+            state=at.state,
         )
 
 

@@ -326,6 +326,15 @@ class AbstractRegistered(AbstractMethod):
         chosen = turn_placement(chosen, seen.frame.mT)
         return self._answer(chosen, weight, seen.similarity, confidence)
 
+    @torch.no_grad()
+    def voted_placement(
+        self, observation: Observation
+    ) -> tuple[Placement, Float[Tensor, " B"], Similarity]:
+        """What the network alone says: a placement in normalised clouds, how sure it is."""
+        seen = self._seen(observation)
+        placement, _, sure = self._voted(seen)
+        return turn_placement(placement, seen.frame.mT), sure, seen.similarity
+
     def _has_learned(self) -> bool:
         """Whether there is a network to ask: not in models from before cameras were asked for it.
 

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: MIT
+"""How the template of a run lies in whole surfaces, where that run learned single views.
+
+A whole surface is looked at from many sides, as far away as the run's cameras were: of its points
+those stay that a camera there would see (hidden point removal by a convex hull, Katz, Tal and Basri
+2007). The run's network says of each side how the template lies; sides that no camera ever saw are
+told wrongly, each in its own way, the others agree, so the rotation that most of them say is
+taken. Of the sides that say so the one counts whose placement fits the whole surface best, and is
+fitted to it. Distances of the template's points count as they are, those of the surface's at most
+`FAR`: what no view showed the template does not have.
+
+Lengths are in normalised units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from scapo.geometry.points import gather, nearest
+from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.records import cat, take
+from scapo.registered.base import AbstractRegistered
+from scapo.registered.pairwise import within
+from scapo.registered.synchronisation import densest
+from scapo.registered.template import Placement, across_axis
+from scapo.types import Observation
+
+SIDES = 24
+REACH = 10.0**1.5
+"""Radius of the sphere at which points are flipped for hidden point removal, over the farthest
+point's distance: with more, points are seen through gaps of a thousand points."""
+SHOWN = 384  # Points of a side that are looked at; where fewer are seen they are repeated
+AGREES = 25.0  # Degrees from the rotation that most sides say
+MISFIT = 20.0  # What a side's word counts: how sure it is, times exp(-MISFIT x misfit)
+FITTED = (256, 512)  # Points of the template and of a surface that are compared
+STEPS, RATE = 40, 0.02  # Of Adam; the rate falls to a tenth
+FAR = 0.08
+SIZE, ASIDE = 0.05, 0.4  # Weights of squared log scales from the start's, and of squared shifts
+FREE = ("translation", "log_scale", "state", "shift")
+
+
+def lying(
+    run: AbstractRegistered, surfaces: Float[Tensor, "B N 3"]
+) -> tuple[Placement, Float[Tensor, " B"]]:
+    """Where the template of a run with a network for known cameras lies, and the misfit left.
+
+    Args:
+        run: Trained on single views.
+        surfaces: Normalised, in any pose.
+    """
+    every = [_said(run, surfaces, camera) for camera in _cameras(run)]
+    rotation = torch.stack([said.rotation for said, _ in every], 1)  # (B, S, 3, 3)
+    shapes = [run.template.with_points(FITTED[0]).place(said)[0] for said, _ in every]
+    some = surfaces[:, :: max(1, surfaces.shape[1] // FITTED[1])]
+    off = torch.stack([misfit(some, shape) for shape in shapes], 1)
+    vote = torch.stack([sure for _, sure in every], 1) * torch.exp(-MISFIT * off)
+    pairs = zip(rotation, vote, strict=True)
+    common = torch.stack([densest(turns, votes)[0] for turns, votes in pairs])
+    agree = within((rotation * common[:, None]).sum((-1, -2)), AGREES)
+    best = torch.where(agree, off, off + 1).argmin(1)
+    row = torch.arange(len(best))
+    begun = take(cat([said for said, _ in every]), best * len(best) + row)
+    return _fitted(run, some, begun)
+
+
+def _cameras(run: AbstractRegistered) -> Iterator[Float[Tensor, " 3"]]:
+    """Spread over a sphere (Fibonacci's), as far away as those that were learned from."""
+    away = run.pseudo.camera[run.pseudo.trust > 0].norm(dim=1).median()
+    number = torch.arange(SIDES) + 0.5
+    height, angle = 1 - 2 * number / SIDES, torch.pi * (1 + 5**0.5) * number
+    radius = (1 - height.square()).sqrt()
+    yield from away * torch.stack([angle.cos() * radius, angle.sin() * radius, height], 1)
+
+
+def _said(
+    run: AbstractRegistered, surfaces: Float[Tensor, "B N 3"], camera: Float[Tensor, " 3"]
+) -> tuple[Placement, Float[Tensor, " B"]]:
+    """What the run's network says of the side that a camera sees, and how sure it is."""
+    side = torch.stack([_shown(points[seen(points, camera)]) for points in surfaces])
+    where = camera.expand(len(surfaces), 3)
+    said, sure, similarity = run.voted_placement(Observation(points=side, sensor=where))
+    size = 1 / similarity.scale[:, None]
+    sliding = torch.tensor([kind == "prismatic" for kind in run.template.kinds])
+    placement = replace(
+        said,
+        translation=said.translation * size + similarity.centre,
+        log_scale=said.log_scale + size.log(),
+        state=torch.where(sliding, said.state * size, said.state),
+        shift=said.shift * size[..., None],
+    )
+    return placement, sure
+
+
+def seen(points: Float[Tensor, "N 3"], camera: Float[Tensor, " 3"]) -> Bool[Tensor, " N"]:
+    """Which points a camera sees: hidden point removal."""
+    from scipy.spatial import ConvexHull
+
+    away = (points - camera).double().numpy()
+    far = np.linalg.norm(away, axis=1, keepdims=True)
+    flipped = away * (2 * REACH * far.max() / far - 1)
+    corner = ConvexHull(np.vstack([flipped, np.zeros((1, 3))])).vertices
+    mask = torch.zeros(len(points) + 1, dtype=torch.bool)
+    mask[torch.as_tensor(corner.astype(np.int64))] = True
+    return mask[:-1]
+
+
+def _shown(points: Float[Tensor, "N 3"]) -> Float[Tensor, "K 3"]:
+    """As many points of any number of them, spread over their order."""
+    return points[torch.arange(SHOWN) * max(len(points), SHOWN) // SHOWN % len(points)]
+
+
+def misfit(surfaces: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"]) -> Float[Tensor, " B"]:
+    """Mean distance of the shapes' points to the nearest of the surfaces, and back up to `FAR`."""
+    there = (shapes - gather(surfaces, nearest(shapes, surfaces))).square().sum(-1)
+    back = (surfaces - gather(shapes, nearest(surfaces, shapes))).square().sum(-1)
+    far = FAR * torch.tanh((back + 1e-6).sqrt() / FAR)
+    return (there + 1e-6).sqrt().mean(1) + far.mean(1)
+
+
+@torch.enable_grad()
+def _fitted(
+    run: AbstractRegistered, surfaces: Float[Tensor, "B N 3"], begun: Placement
+) -> tuple[Placement, Float[Tensor, " B"]]:
+    """Adam on the misfit."""
+    template = run.template.with_points(FITTED[0]).requires_grad_(False)
+    free = [torch.zeros_like(begun.translation), *(getattr(begun, name).clone() for name in FREE)]
+    free = [value.requires_grad_() for value in free]
+    across = torch.stack([across_axis(axis) for axis in template.directions()])  # (J, 2, 3)
+
+    def placed() -> Placement:
+        values = dict(zip(FREE, free[1:], strict=True))
+        values["shift"] = (across.mT @ across @ values["shift"][..., None])[..., 0]
+        return replace(begun, rotation=begun.rotation @ rotvec_to_rotmat(free[0]), **values)
+
+    def cost(at: Placement) -> Tensor:
+        sizes = (at.log_scale - begun.log_scale).square().mean(1)
+        price = SIZE * sizes + ASIDE * at.shift.square().sum((1, 2))
+        return misfit(surfaces, template.place(at)[0]) + price
+
+    optimizer = torch.optim.Adam(free, lr=RATE, betas=(0.9, 0.99))
+    for k in range(STEPS):
+        optimizer.param_groups[0]["lr"] = RATE * 0.1 ** (k / STEPS)
+        optimizer.zero_grad()
+        cost(placed()).sum().backward()
+        optimizer.step()
+    end = placed()
+    end = Placement(**{one.name: getattr(end, one.name).detach() for one in fields(end)})
+    return end, misfit(surfaces, template.place(end)[0])
