@@ -16,6 +16,7 @@ from scapo.geometry.points import nearest, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import Mode, Step, evenly
+from scapo.paper import warm_start
 from scapo.paper.autoencoder import Encoding
 from scapo.paper.config import warm_config
 from scapo.paper.first_targets import first_targets
@@ -26,7 +27,8 @@ from scapo.registered.method import load_run
 from scapo.store.schema import StoreError
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.placed import Told as Oracle
-from tests.helpers.placed import placed_run
+from tests.helpers.placed import placed, placed_run
+from tests.helpers.sighted import sighted
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import TINY, tiny
 
@@ -152,6 +154,70 @@ def test_two_plates_told_the_other_way_round_are_the_same_surfaces() -> None:
         translation=torch.stack([told.translation[0], *other.translation[1:]]),
     )
     assert_close(told.nearer(other, mixed).rotation[0], turn[0])
+
+
+def glasses() -> Told:
+    """A bar with a leg at either end, of which half a turn about y exchanges the legs."""
+    draw = generator(9)
+    bar = (torch.rand(200, 3, generator=draw) - 0.5) * torch.tensor([0.5, 0.02, 0.06])
+    leg = torch.rand(100, 3, generator=draw) * torch.tensor([0.01, 0.4, 0.03])
+    left = leg + torch.tensor([0.25, 0.0, 0.0])
+    right = left * torch.tensor([-1.0, 1.0, -1.0])
+    pivot = torch.tensor([[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0]])
+    return Told(
+        rotation=rotvec_to_rotmat(torch.randn(3, 3, generator=draw)),
+        translation=torch.randn(3, 3, generator=draw),
+        shape=torch.cat([bar, left, right]).expand(3, -1, -1),
+        part=torch.tensor([0, 1, 2]).repeat_interleave(torch.tensor([200, 100, 100])).expand(3, -1),
+        pivot=pivot.expand(3, -1, -1),
+        axis=torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]).expand(3, -1, -1),
+        state=torch.tensor([[0.2, -0.9], [1.1, -0.1], [0.6, -0.6]]),
+    )
+
+
+def test_two_legs_told_the_other_way_round_are_the_same_surfaces() -> None:
+    told, two = glasses(), ("revolute", "revolute")
+    exchange = Exchange.of(told)
+    assert_close(exchange.turn, torch.diag(torch.tensor([-1.0, 1.0, -1.0])), atol=0.06, rtol=0)
+    other = told.exchanged(exchange)
+    assert_close(other.shape, told.shape, atol=0.06, rtol=0)
+    # Either joint keeps its direction, so the states are told as they count for it.
+    assert_close(other.axis, told.axis, atol=0.06, rtol=0)
+    assert_close(other.state, -told.state.flip(1))
+
+    def placed(one: Told) -> Tensor:
+        return one.observed(two) @ one.rotation.mT + one.translation[:, None]
+
+    for mine, its in ((0, 0), (1, 2), (2, 1)):
+        found = placed(other)[:, told.part[0] == mine]
+        assert_close(found.mean(1), placed(told)[:, told.part[0] == its].mean(1), atol=0.03, rtol=0)
+    back = other.exchanged(exchange)
+    assert_close(back.rotation, told.rotation, atol=1e-5, rtol=0)
+    assert_close(back.translation, told.translation, atol=2e-3, rtol=0)
+    assert_close(back.pivot, told.pivot, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(("category", "two"), [("oven", False), ("eyeglasses", True)])
+def test_two_readings_are_asked_for_where_parts_may_change_places(category: str, two: bool) -> None:
+    method, _ = oracle()
+    method.category = CATEGORIES[category]
+    assert WarmStart(method).two_readings == two
+
+
+def test_whole_surfaces_are_told_of_as_the_template_lies_on_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    views, truth = sighted(3, seed=60)
+    truth.shift.copy_(torch.tensor([0.02, 0.0, 0.01]))
+    truth.log_scale.copy_(torch.tensor([0.1, -0.1, 0.05]))
+    monkeypatch.setattr(warm_start, "lying", lambda *_: (truth, torch.zeros(3)))
+    run = placed()
+    told = WarmStart(run, surfaces=True).of(Observation(points=views.points), torch.arange(3))
+    shapes = told.observed(KINDS) @ told.rotation.mT + told.translation[:, None]
+    posed, _ = run.template.place(truth)
+    assert_close(shapes, posed, atol=2e-3, rtol=0)  # parts are hard in one, blended in the other
+    with pytest.raises(ValueError, match="expected a template, found a run without one"):
+        WarmStart(oracle()[0], surfaces=True).of(Observation(points=views.points), torch.arange(3))
 
 
 def test_each_cloud_is_asked_about_once() -> None:
