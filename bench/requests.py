@@ -18,7 +18,7 @@ import tyro
 from bench.matching import LabelOrder
 from bench.metrics import ApRule, IouKind, PivotKind, RotationKind
 
-Mode = Literal["fast", "quick", "refine"]
+Mode = Literal["fast", "quick", "refine", "whole"]
 """`scapo.method.Mode`, written out: that module loads torch."""
 Precision = Literal["float32", "bfloat16", "float16"]
 """`scapo.training.precision.Precision`, likewise."""
@@ -148,7 +148,8 @@ class PredictRequest(RunRequest):
     split: str = "test"
     """Split to predict."""
     mode: Mode = "fast"
-    """fast: networks only; refine: with optimisation at test time; quick: with a little of it."""
+    """fast: networks only; refine: with optimisation at test time; quick: with a little of it;
+    whole: for clouds that show all of an object, not the side that a camera sees."""
     oracle: bool = False
     """Show a method that can use them true labels of the test split (icp: the parts); the
     variant then begins with oracle."""
@@ -332,7 +333,8 @@ class ModelRequest:
     """Category whose released model answers. With neither, every released model is asked, and the
     one whose shape explains the view best is taken."""
     mode: Mode = "refine"
-    """fast: networks only; refine: with optimisation at test time; quick: with a little of it."""
+    """fast: networks only; refine: with optimisation at test time; quick: with a little of it;
+    whole: for clouds that show all of an object, not the side that a camera sees."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
 

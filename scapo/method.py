@@ -19,7 +19,7 @@ from scapo.categories import Category
 from scapo.pictures import PictureData
 from scapo.types import Labels, Observation, Prediction, Supervision
 
-Mode = Literal["fast", "quick", "refine"]
+Mode = Literal["fast", "quick", "refine", "whole"]
 T = TypeVar("T")
 SEEDS = 2**31  # Of generators
 
@@ -284,7 +284,8 @@ class AbstractMethod(nn.Module, ABC):
         Args:
             observation: A batch, camera frame, metres.
             mode: `fast`, networks only; `refine`, with search or optimisation at test time;
-                `quick`, with a little of it. A method that knows no such way takes the one it
+                `quick`, with a little of it; `whole`, for clouds that show all of an object, not
+                the side that a camera sees. A method that knows no such way takes the one it
                 knows in all modes.
         """
 

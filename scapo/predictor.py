@@ -69,8 +69,8 @@ class Predictor:
 
         Args:
             points: (..., N, 3), camera frame, metres, numpy or torch.
-            mode: `fast`, networks only, `quick` or `refine`; by default the method's own choice,
-                `quick` for template registration.
+            mode: `fast`, networks only, `quick` or `refine`, or `whole` for clouds that show all
+                of an object; by default the method's own choice, `quick` for template registration.
             sensor: (..., 3), centre of the camera, metres, for clouds in another frame than the
                 camera's. What a `registered` model uses.
             color: (..., N, 3), in [0, 1], for methods that look at it.

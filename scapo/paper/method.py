@@ -215,7 +215,7 @@ class Scapo(AbstractMethod):
                     f"supervision: expected what {self.config.start} was told, {hidden}, "
                     f"found it left out; add --supervision {hidden}"
                 )
-            self._run = WarmStart(run, surfaces=self.config.told_of == "surfaces")
+            self._run = WarmStart(run, "whole" if self.config.told_of == "surfaces" else "quick")
         return self._run
 
     def _searched(self, aligned: Float[Tensor, "B N 3"], medoid: int) -> tuple[Skeleton, Lying]:

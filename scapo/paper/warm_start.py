@@ -28,8 +28,6 @@ from scapo.paper.first_targets import Lying
 from scapo.paper.objectives import LossConfig
 from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
 from scapo.records import cat, map_tensors, take
-from scapo.registered.base import AbstractRegistered
-from scapo.registered.surfaces import lying
 from scapo.types import Observation
 
 POINTS = 1024
@@ -227,20 +225,10 @@ class WarmStart:
     what the encoder says is learned.
     """
 
-    def __init__(
-        self, method: AbstractMethod, mode: Mode = "quick", *, surfaces: bool = False
-    ) -> None:
-        """A method whose predictions have canonical points with parts, in one order for all.
-
-        Args:
-            method: Trained.
-            mode: In which it is asked.
-            surfaces: Clouds are whole surfaces, on which its template is laid
-                (`registered.surfaces`); it is a `registered` then.
-        """
+    def __init__(self, method: AbstractMethod, mode: Mode = "quick") -> None:
+        """A method whose predictions have canonical points with parts, in one order for all."""
         self.method = method
         self.mode: Mode = mode
-        self.surfaces = surfaces
         self.known: dict[int, Told] = {}
         kinds = [joint.kind for joint in method.category.joints]
         hinges = kinds in (["revolute"], ["revolute"] * 2)
@@ -290,8 +278,6 @@ class WarmStart:
 
     @torch.no_grad()
     def _ask(self, observation: Observation) -> Told:
-        if self.surfaces:
-            return self._laid(observation)
         said = self.method.predict(observation, self.mode)
         pose, joints = said.camera_T_part, said.joints
         shape, part = said.canonical_points, said.canonical_part
@@ -308,24 +294,6 @@ class WarmStart:
             pivot=apply(invert(base), joints.pivot) * scale[..., None],
             axis=joints.axis @ base[:, :3, :3],
             state=torch.where(slide, joints.state * scale, joints.state),
-        )
-
-    def _laid(self, observation: Observation) -> Told:
-        """As the run's template lies in whole surfaces."""
-        if not isinstance(self.method, AbstractRegistered):
-            raise ValueError(f"{self.method.name}: expected a template, found a run without one")
-        template, (points, _) = self.method.template, normalise(observation.points)
-        at, _ = lying(self.method, points)
-        part, size = template.logit.argmax(-1)[:POINTS], at.log_scale.exp()[:, None]
-        child = F.one_hot(part, at.state.shape[1] + 1)[:, 1:].to(size)
-        return Told(
-            rotation=at.rotation,
-            translation=at.translation,
-            shape=template.points[:POINTS] * size + child @ at.shift,
-            part=part.expand(len(points), -1),
-            pivot=template.pivot * size + at.shift,
-            axis=template.directions().expand(len(points), -1, -1),
-            state=at.state,
         )
 
 

@@ -24,7 +24,7 @@ from scapo.pictures import PictureData
 from scapo.records import cat, take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import SearchConfig
-from scapo.registered.decode import metric_limits
+from scapo.registered.decode import metric_limits, nearest_weights
 from scapo.registered.discovery import Discovery
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
@@ -62,6 +62,7 @@ from scapo.registered.pose_search import (
     successive_halving,
 )
 from scapo.registered.pseudo_labels import Candidates, PseudoLabels, ViewTargets
+from scapo.registered.surfaces import lying
 from scapo.registered.template import (
     ArticulatedTemplate,
     Placement,
@@ -317,6 +318,8 @@ class AbstractRegistered(AbstractMethod):
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Parts, poses and joints."""
+        if mode == "whole":
+            return self._of_surfaces(observation.points.to(self.template.points))
         seen = self._seen(observation)
         if mode == "fast" and self._has_learned():
             chosen, weight, confidence = self._voted(seen)
@@ -326,11 +329,28 @@ class AbstractRegistered(AbstractMethod):
         chosen = turn_placement(chosen, seen.frame.mT)
         return self._answer(chosen, weight, seen.similarity, confidence)
 
-    @torch.no_grad()
-    def voted_placement(
+    def _of_surfaces(self, points: Float[Tensor, "B N 3"]) -> Prediction:
+        """Of clouds that show all of an object, not the side that a camera sees.
+
+        Raises:
+            ValueError: A model without a network that knows cameras.
+        """
+        if isinstance(self.network, PointVotes) or not self._has_learned():
+            raise ValueError(
+                "mode whole: expected a model whose network learned views of a known camera, "
+                "found one without"
+            )
+        clouds, similarity = normalise(points)
+        away = float(self.pseudo.camera[self.pseudo.trust > 0].norm(dim=1).median())
+        placement, sure = lying(self.template, self._of_view, away, clouds)
+        normals = torch.zeros_like(clouds)  # Which way a surface faces is not known
+        weight = nearest_weights(self.template, clouds, normals, placement)
+        return self._answer(placement, weight, similarity, sure)
+
+    def _of_view(
         self, observation: Observation
     ) -> tuple[Placement, Float[Tensor, " B"], Similarity]:
-        """What the network alone says: a placement in normalised clouds, how sure it is."""
+        """What the network alone says of a view: a placement in normalised clouds, how sure."""
         seen = self._seen(observation)
         placement, _, sure = self._voted(seen)
         return turn_placement(placement, seen.frame.mT), sure, seen.similarity

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""How the template of a run lies in whole surfaces, where that run learned single views.
+"""How a template lies in whole surfaces, where it was learned from single views.
 
-A whole surface is looked at from many sides, as far away as the run's cameras were: of its points
+A whole surface is looked at from many sides, as far away as the views' cameras were: of its points
 those stay that a camera there would see (hidden point removal by a convex hull, Katz, Tal and Basri
-2007). The run's network says of each side how the template lies; sides that no camera ever saw are
+2007). The network says of each side how the template lies; sides that no camera ever saw are
 told wrongly, each in its own way, the others agree, so the rotation that most of them say is
 taken. Of the sides that say so the one counts whose placement fits the whole surface best, and is
 fitted to it. Distances of the template's points count as they are, those of the surface's at most
@@ -14,7 +14,7 @@ Lengths are in normalised units.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 
 import numpy as np
@@ -22,13 +22,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from scapo.geometry.points import gather, nearest
+from scapo.geometry.points import Similarity, gather, nearest
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
-from scapo.registered.base import AbstractRegistered
 from scapo.registered.pairwise import within
 from scapo.registered.synchronisation import densest
-from scapo.registered.template import Placement, across_axis
+from scapo.registered.template import ArticulatedTemplate, Placement, across_axis, slides
 from scapo.types import Observation
 
 SIDES = 24
@@ -45,33 +44,39 @@ SIZE, ASIDE = 0.05, 0.4  # Weights of squared log scales from the start's, and o
 FREE = ("translation", "log_scale", "state", "shift")
 
 
+Ask = Callable[[Observation], tuple[Placement, Float[Tensor, " B"], Similarity]]
+"""A network's word of views: placements in normalised clouds, how sure it is, that normalisation"""
+
+
+@torch.no_grad()
 def lying(
-    run: AbstractRegistered, surfaces: Float[Tensor, "B N 3"]
+    template: ArticulatedTemplate, ask: Ask, away: float, surfaces: Float[Tensor, "B N 3"]
 ) -> tuple[Placement, Float[Tensor, " B"]]:
-    """Where the template of a run with a network for known cameras lies, and the misfit left.
+    """Where the template lies, and which share of the sides' word says so.
 
     Args:
-        run: Trained on single views.
+        template: That the network knows.
+        ask: The network.
+        away: Distance of the cameras from the middle of a surface.
         surfaces: Normalised, in any pose.
     """
-    every = [_said(run, surfaces, camera) for camera in _cameras(run)]
+    every = [_said(template, ask, surfaces, camera) for camera in _cameras(away)]
     rotation = torch.stack([said.rotation for said, _ in every], 1)  # (B, S, 3, 3)
-    shapes = [run.template.with_points(FITTED[0]).place(said)[0] for said, _ in every]
+    shapes = [template.with_points(FITTED[0]).place(said)[0] for said, _ in every]
     some = surfaces[:, :: max(1, surfaces.shape[1] // FITTED[1])]
     off = torch.stack([misfit(some, shape) for shape in shapes], 1)
     vote = torch.stack([sure for _, sure in every], 1) * torch.exp(-MISFIT * off)
     pairs = zip(rotation, vote, strict=True)
-    common = torch.stack([densest(turns, votes)[0] for turns, votes in pairs])
-    agree = within((rotation * common[:, None]).sum((-1, -2)), AGREES)
+    common, share = zip(*(densest(turns, votes) for turns, votes in pairs), strict=True)
+    agree = within((rotation * torch.stack(common)[:, None]).sum((-1, -2)), AGREES)
     best = torch.where(agree, off, off + 1).argmin(1)
-    row = torch.arange(len(best))
+    row = torch.arange(len(best), device=best.device)
     begun = take(cat([said for said, _ in every]), best * len(best) + row)
-    return _fitted(run, some, begun)
+    return _fitted(template, some, begun), torch.stack(share)
 
 
-def _cameras(run: AbstractRegistered) -> Iterator[Float[Tensor, " 3"]]:
-    """Spread over a sphere (Fibonacci's), as far away as those that were learned from."""
-    away = run.pseudo.camera[run.pseudo.trust > 0].norm(dim=1).median()
+def _cameras(away: float) -> Iterator[Float[Tensor, " 3"]]:
+    """Spread over a sphere (Fibonacci's)."""
     number = torch.arange(SIDES) + 0.5
     height, angle = 1 - 2 * number / SIDES, torch.pi * (1 + 5**0.5) * number
     radius = (1 - height.square()).sqrt()
@@ -79,19 +84,22 @@ def _cameras(run: AbstractRegistered) -> Iterator[Float[Tensor, " 3"]]:
 
 
 def _said(
-    run: AbstractRegistered, surfaces: Float[Tensor, "B N 3"], camera: Float[Tensor, " 3"]
+    template: ArticulatedTemplate,
+    ask: Ask,
+    surfaces: Float[Tensor, "B N 3"],
+    camera: Float[Tensor, " 3"],
 ) -> tuple[Placement, Float[Tensor, " B"]]:
-    """What the run's network says of the side that a camera sees, and how sure it is."""
+    """What the network says of the side that a camera sees, and how sure it is."""
+    camera = camera.to(surfaces)
     side = torch.stack([_shown(points[seen(points, camera)]) for points in surfaces])
     where = camera.expand(len(surfaces), 3)
-    said, sure, similarity = run.voted_placement(Observation(points=side, sensor=where))
+    said, sure, similarity = ask(Observation(points=side, sensor=where))
     size = 1 / similarity.scale[:, None]
-    sliding = torch.tensor([kind == "prismatic" for kind in run.template.kinds])
     placement = replace(
         said,
         translation=said.translation * size + similarity.centre,
         log_scale=said.log_scale + size.log(),
-        state=torch.where(sliding, said.state * size, said.state),
+        state=torch.where(slides(template)[:, 0] > 0, said.state * size, said.state),
         shift=said.shift * size[..., None],
     )
     return placement, sure
@@ -101,13 +109,13 @@ def seen(points: Float[Tensor, "N 3"], camera: Float[Tensor, " 3"]) -> Bool[Tens
     """Which points a camera sees: hidden point removal."""
     from scipy.spatial import ConvexHull
 
-    away = (points - camera).double().numpy()
+    away = (points - camera).double().cpu().numpy()
     far = np.linalg.norm(away, axis=1, keepdims=True)
     flipped = away * (2 * REACH * far.max() / far - 1)
     corner = ConvexHull(np.vstack([flipped, np.zeros((1, 3))])).vertices
     mask = torch.zeros(len(points) + 1, dtype=torch.bool)
     mask[torch.as_tensor(corner.astype(np.int64))] = True
-    return mask[:-1]
+    return mask[:-1].to(points.device)
 
 
 def _shown(points: Float[Tensor, "N 3"]) -> Float[Tensor, "K 3"]:
@@ -125,10 +133,10 @@ def misfit(surfaces: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"]) -> 
 
 @torch.enable_grad()
 def _fitted(
-    run: AbstractRegistered, surfaces: Float[Tensor, "B N 3"], begun: Placement
-) -> tuple[Placement, Float[Tensor, " B"]]:
+    template: ArticulatedTemplate, surfaces: Float[Tensor, "B N 3"], begun: Placement
+) -> Placement:
     """Adam on the misfit."""
-    template = run.template.with_points(FITTED[0]).requires_grad_(False)
+    template = template.with_points(FITTED[0]).requires_grad_(False)
     free = [torch.zeros_like(begun.translation), *(getattr(begun, name).clone() for name in FREE)]
     free = [value.requires_grad_() for value in free]
     across = torch.stack([across_axis(axis) for axis in template.directions()])  # (J, 2, 3)
@@ -150,5 +158,4 @@ def _fitted(
         cost(placed()).sum().backward()
         optimizer.step()
     end = placed()
-    end = Placement(**{one.name: getattr(end, one.name).detach() for one in fields(end)})
-    return end, misfit(surfaces, template.place(end)[0])
+    return Placement(**{one.name: getattr(end, one.name).detach() for one in fields(end)})

@@ -5,18 +5,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from scapo.categories import CATEGORIES
+from scapo.categories import CATEGORIES, JointKind
 from scapo.geometry.points import nearest, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import Mode, Step, evenly
-from scapo.paper import warm_start
 from scapo.paper.autoencoder import Encoding
 from scapo.paper.config import warm_config
 from scapo.paper.first_targets import first_targets
@@ -27,12 +27,12 @@ from scapo.registered.method import load_run
 from scapo.store.schema import StoreError
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.placed import Told as Oracle
-from tests.helpers.placed import placed, placed_run
-from tests.helpers.sighted import sighted
+from tests.helpers.placed import placed_run
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import TINY, tiny
 
 KINDS = ("revolute",)
+LEGS: tuple[JointKind, ...] = ("revolute", "revolute")
 WARM = replace(
     TINY,
     preset="warm",
@@ -176,7 +176,7 @@ def glasses() -> Told:
 
 
 def test_two_legs_told_the_other_way_round_are_the_same_surfaces() -> None:
-    told, two = glasses(), ("revolute", "revolute")
+    told = glasses()
     exchange = Exchange.of(told)
     assert_close(exchange.turn, torch.diag(torch.tensor([-1.0, 1.0, -1.0])), atol=0.06, rtol=0)
     other = told.exchanged(exchange)
@@ -186,7 +186,7 @@ def test_two_legs_told_the_other_way_round_are_the_same_surfaces() -> None:
     assert_close(other.state, -told.state.flip(1))
 
     def placed(one: Told) -> Tensor:
-        return one.observed(two) @ one.rotation.mT + one.translation[:, None]
+        return one.observed(LEGS) @ one.rotation.mT + one.translation[:, None]
 
     for mine, its in ((0, 0), (1, 2), (2, 1)):
         found = placed(other)[:, told.part[0] == mine]
@@ -202,22 +202,6 @@ def test_two_readings_are_asked_for_where_parts_may_change_places(category: str,
     method, _ = oracle()
     method.category = CATEGORIES[category]
     assert WarmStart(method).two_readings == two
-
-
-def test_whole_surfaces_are_told_of_as_the_template_lies_on_them(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    views, truth = sighted(3, seed=60)
-    truth.shift.copy_(torch.tensor([0.02, 0.0, 0.01]))
-    truth.log_scale.copy_(torch.tensor([0.1, -0.1, 0.05]))
-    monkeypatch.setattr(warm_start, "lying", lambda *_: (truth, torch.zeros(3)))
-    run = placed()
-    told = WarmStart(run, surfaces=True).of(Observation(points=views.points), torch.arange(3))
-    shapes = told.observed(KINDS) @ told.rotation.mT + told.translation[:, None]
-    posed, _ = run.template.place(truth)
-    assert_close(shapes, posed, atol=2e-3, rtol=0)  # parts are hard in one, blended in the other
-    with pytest.raises(ValueError, match="expected a template, found a run without one"):
-        WarmStart(oracle()[0], surfaces=True).of(Observation(points=views.points), torch.arange(3))
 
 
 def test_each_cloud_is_asked_about_once() -> None:
@@ -301,6 +285,17 @@ def test_the_run_is_read_from_disk_and_is_no_part_of_the_model(run: Path) -> Non
     assert read.template.points.abs().sum() > 0
     assert not read.training
     assert warm(run).variant == warm(None).variant
+
+
+@pytest.mark.parametrize(("told_of", "mode"), [("views", "quick"), ("surfaces", "whole")])
+def test_a_run_is_asked_about_what_the_clouds_show(
+    run: Path, told_of: Literal["views", "surfaces"], mode: Mode
+) -> None:
+    config = replace(WARM, start=str(run), told_of=told_of)
+    model = Scapo(config, CATEGORIES["oven"], generator(0))
+    model.start(CANONICALISE, oracle()[1], Labels(), generator(1))
+    assert model._run is not None
+    assert model._run.mode == mode
 
 
 def test_a_start_that_cannot_be_is_refused(run: Path, tmp_path: Path) -> None:

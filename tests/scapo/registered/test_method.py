@@ -11,9 +11,10 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
-from scapo.geometry.points import squared_distances
+from scapo.geometry.points import normalise, squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Mode, Step
+from scapo.registered import base
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.decode import nearest_weights
@@ -277,3 +278,45 @@ def test_departures_are_named_and_a_shorter_training_is_not() -> None:
     assert variant(config) == (
         "discovery.range_cost=0.0 discovery.held_frame=False strays=kept settle=False"
     )
+
+
+def test_whole_surfaces_are_answered_as_the_template_lies_on_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    method, _ = trained(1)
+    truth = Placement.at(random_rotations(2, generator(3)), torch.zeros(2, 3), torch.ones(2, 1))
+    with torch.no_grad():
+        clouds = template(4, 800).place(truth)[0]
+        expected = template(4, 800).part_poses(truth)
+    seen = list[Tensor]()
+
+    def laid(_: object, __: object, ___: float, shown: Tensor) -> tuple[Placement, Tensor]:
+        seen.append(shown)
+        _, similarity = normalise(clouds)
+        at = Placement.at(
+            truth.rotation, -similarity.centre * similarity.scale[:, None], truth.state
+        )
+        at.log_scale.add_(similarity.scale.log()[:, None])
+        return at, torch.tensor([0.4, 0.9])
+
+    monkeypatch.setattr(base, "lying", laid)
+    said = method.predict(Observation(points=clouds), "whole")
+    assert_close(seen[0], normalise(clouds)[0])
+    assert said.camera_T_part is not None
+    assert_close(said.camera_T_part[..., :3, :3], expected.rotation, atol=1e-5, rtol=0)
+    part = template(4, 800).logit.argmax(-1)
+    assert (said.part_weight.argmax(-1) == part).float().mean() > 0.93
+    assert_close(said.confidence, torch.tensor([0.4, 0.9]))
+
+
+def test_a_model_that_knows_no_camera_cannot_be_shown_whole_surfaces() -> None:
+    observation = Observation(points=torch.randn(1, 60, 3, generator=generator(1)))
+    method, _ = trained(1)
+    for camera, learned in (("estimated", 1.0), ("known", 0.0)):
+        config = replace(method.config, camera=camera)
+        other = TemplateRegistration(config, method.category, generator(0))
+        other.pseudo.load_state_dict(method.pseudo.state_dict())
+        if isinstance(other.network, ViewNetwork):
+            other.network.learned.fill_(learned)
+        with pytest.raises(ValueError, match="mode whole: expected a model whose network learned"):
+            other.predict(observation, "whole")
