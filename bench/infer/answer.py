@@ -47,7 +47,7 @@ class _Drawn:
 
 
 def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
-    """The model's answer, without confidences; `evidence` has residual and margin.
+    """The model's answer, without confidences; `evidence` has the margin, of a view the residual.
 
     Args:
         name: Of the input.
@@ -68,7 +68,7 @@ def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
     pivot = _near_parts(parts, own, label[drawn.inlier], model.category)
     limits, words = _limits(parts, model)
     evidence = {} if found.confidence is None else {"margin": float(found.confidence)}
-    if shape is not None:
+    if shape is not None and mode != "whole":  # which is no view
         evidence["residual"] = residual(own, shape, cloud.sensor)
     return Twin(
         name=name,

@@ -83,7 +83,7 @@ def test_values_that_are_not_finite_are_called_that(saved: Path) -> None:
 
 
 def test_another_mode_is_refused_with_those_there_are(saved: Path) -> None:
-    words = "mode: expected one of fast, quick, refine, found 'best'"
+    words = "mode: expected one of fast, quick, refine, whole, found 'best'"
     with pytest.raises(ValueError, match=words):
         inspect.unwrap(Predictor.predict)(load(saved), plates(1, 96)[0].points, "best")
 

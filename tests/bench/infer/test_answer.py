@@ -58,6 +58,12 @@ def test_a_wrong_answer_has_a_larger_residual_and_draws_that_differ_a_larger_spr
     assert unsure.evidence["part_1_spread"] > 5
 
 
+def test_how_well_a_view_is_explained_is_not_said_of_whole_surfaces(told):
+    cloud = Cloud(points=told.clouds()[0])
+    assert "residual" in ask("a", cloud, told_model(told), "fast").evidence
+    assert "residual" not in ask("a", cloud, told_model(told), "whole").evidence
+
+
 def test_points_far_off_belong_to_no_part(told):
     points = told.clouds()[0]
     far = points[:6] + np.array([0, 0, 3], np.float32)
