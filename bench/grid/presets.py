@@ -124,6 +124,8 @@ OBJECTS = replace(REGISTERED, name="registered-objects", seeds=(1,),
 RELEASED = replace(REGISTERED, name="released", seeds=(1,), training=0,
                    models=("{category}/{part}", "{category}"))  # fmt: skip
 """What users get: the models that come with the package, in the frame that they answer in."""
+WHOLE = replace(RELEASED, parts=("complete",), modes=("whole",), seconds={"whole": 0.35})
+"""The same models, which learned single views, asked about whole surfaces."""
 BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("refine",),
               training=300, seconds={"refine": 0.35})  # fmt: skip
 """What its search can do at best, with a template of true placements."""
@@ -131,7 +133,7 @@ WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=OBJECTS,
              flags=OBJECTS.flags, parts=("clean", "sensor"), training=1200,
              seconds={"fast": 0.01})  # fmt: skip
 """The paper's networks, begun at what template registration says: SCAPO, warm start."""
-GRID = (*NETWORKS, *LABELLED, RELEASED, REGISTERED, WARM, BOUND, *ABLATIONS)
+GRID = (*NETWORKS, *LABELLED, RELEASED, WHOLE, REGISTERED, WARM, BOUND, *ABLATIONS)
 
 PRESETS: Mapping[PresetName, Preset] = {
     "smoke": Preset(

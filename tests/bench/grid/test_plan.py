@@ -90,14 +90,17 @@ def test_a_released_model_is_asked_by_its_name(tmp_path: Path, monkeypatch):
         path.write_text(name)
     monkeypatch.setattr("bench.grid.plan.weights", lambda: models)
     first = [c for c in make_plan("cpu", tmp_path).chains if c.label == "released"]
-    assert [c.name for c in first] == [
-        "clean/oven/released/seed1", "sensor/laptop/released/seed1"
-    ]  # fmt: skip
-    for chain, name in zip(first, ("oven", "laptop/sensor"), strict=True):
+    views, whole = ("fast", "quick", "refine"), ("whole",)
+    asked_for = {
+        "clean/oven/released/seed1": ("oven", views),
+        "complete/oven/released/seed1": ("oven", whole),
+        "sensor/laptop/released/seed1": ("laptop/sensor", views),
+    }
+    assert [c.name for c in first] == list(asked_for)
+    for chain, (name, modes) in zip(first, asked_for.values(), strict=True):
         asked = [step for step in chain.steps if step.kind == "predict"]
         assert {step.name for step in asked} == {
-            f"predict-{mode}-{split}" for mode in ("fast", "quick", "refine")
-            for split in ("test", "test-ood")
+            f"predict-{mode}-{split}" for mode in modes for split in ("test", "test-ood")
         }  # fmt: skip
         assert all(step.command[1] == name and not step.needs for step in asked)
         assert all(step.command[-2:] == ("--row", "released") for step in asked)
@@ -106,7 +109,7 @@ def test_a_released_model_is_asked_by_its_name(tmp_path: Path, monkeypatch):
     models["oven"].write_text("another")
     again = [c for c in make_plan("cpu", tmp_path).chains if c.label == "released"]
     assert again[0] != first[0]  # another model is another plan
-    assert again[1] == first[1]
+    assert again[2] == first[2]
 
 
 def test_a_budget_bounds_the_epochs():
