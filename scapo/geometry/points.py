@@ -275,3 +275,15 @@ def normalise(points: Float[Tensor, "*B N 3"]) -> tuple[Float[Tensor, "*B N 3"],
         )
     similarity = Similarity(scale=MEAN_RADIUS / radius, centre=centre)
     return similarity.forward(points), similarity
+
+
+def fibonacci_sphere(count: int) -> Float[Tensor, "{count} 3"]:
+    """Unit vectors spread over the sphere, from z down: the first half are those of a half sphere.
+
+    >>> fibonacci_sphere(1000).mean(0).norm().item() < 1e-3
+    True
+    """
+    number = torch.arange(count) + 0.5
+    height, angle = 1 - 2 * number / count, torch.pi * (1 + 5**0.5) * number
+    radius = (1 - height.square()).sqrt()
+    return torch.stack([angle.cos() * radius, angle.sin() * radius, height], 1)

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from scapo.geometry.points import chamfer, normalise
+from scapo.geometry.points import chamfer, fibonacci_sphere, normalise
 from scapo.geometry.rigid import apply, invert, joint_motion, rigid
 from scapo.method import AbstractMethod, Mode
 from scapo.paper import losses
@@ -176,8 +176,8 @@ class Exchange:
             return across[chosen], turns[chosen]
 
         if two:
-            rough, _ = best(_hemisphere(HALF_TURNS**2 // 36).to(shape))
-            near = _hemisphere(HALF_TURNS).to(shape) * NEAR
+            rough, _ = best(_half_sphere(shape, HALF_TURNS**2 // 36))
+            near = NEAR * _half_sphere(shape, HALF_TURNS)
             _, turn = best(F.normalize(rough + torch.cat([near, -near]), dim=-1))
         else:
             _, turn = best(_across(told, shape, centre))
@@ -203,12 +203,8 @@ def _across(
     return angle.cos() * first + angle.sin() * torch.linalg.cross(axis, first)
 
 
-def _hemisphere(count: int) -> Float[Tensor, "{count} 3"]:
-    """Directions spread over half a sphere (Fibonacci's)."""
-    number = torch.arange(count) + 0.5
-    height, angle = number / count, torch.pi * (1 + 5**0.5) * number
-    radius = (1 - height.square()).sqrt()
-    return torch.stack([angle.cos() * radius, angle.sin() * radius, height], 1)
+def _half_sphere(like: Tensor, count: int) -> Float[Tensor, "{count} 3"]:
+    return fibonacci_sphere(2 * count)[:count].to(like)
 
 
 def frame_errors(encoding: Encoding, told: Told) -> Float[Tensor, " B"]:

@@ -14,7 +14,7 @@ Lengths are in normalised units.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from scapo.geometry.points import Similarity, gather, nearest
+from scapo.geometry.points import Similarity, fibonacci_sphere, gather, nearest
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
 from scapo.registered.pairwise import within
@@ -60,7 +60,7 @@ def lying(
         away: Distance of the cameras from the middle of a surface.
         surfaces: Normalised, in any pose.
     """
-    every = [_said(template, ask, surfaces, camera) for camera in _cameras(away)]
+    every = [_said(template, ask, surfaces, camera) for camera in away * fibonacci_sphere(SIDES)]
     rotation = torch.stack([said.rotation for said, _ in every], 1)  # (B, S, 3, 3)
     shapes = [template.with_points(FITTED[0]).place(said)[0] for said, _ in every]
     some = surfaces[:, :: max(1, surfaces.shape[1] // FITTED[1])]
@@ -73,14 +73,6 @@ def lying(
     row = torch.arange(len(best), device=best.device)
     begun = take(cat([said for said, _ in every]), best * len(best) + row)
     return _fitted(template, some, begun), torch.stack(share)
-
-
-def _cameras(away: float) -> Iterator[Float[Tensor, " 3"]]:
-    """Spread over a sphere (Fibonacci's)."""
-    number = torch.arange(SIDES) + 0.5
-    height, angle = 1 - 2 * number / SIDES, torch.pi * (1 + 5**0.5) * number
-    radius = (1 - height.square()).sqrt()
-    yield from away * torch.stack([angle.cos() * radius, angle.sin() * radius, height], 1)
 
 
 def _said(
