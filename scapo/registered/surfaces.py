@@ -98,13 +98,16 @@ def _said(
 
 
 def seen(points: Float[Tensor, "N 3"], camera: Float[Tensor, " 3"]) -> Bool[Tensor, " N"]:
-    """Which points a camera sees: hidden point removal."""
-    from scipy.spatial import ConvexHull
+    """Which points a camera sees: hidden point removal. All, where they lie in one plane with it."""
+    from scipy.spatial import ConvexHull, QhullError
 
     away = (points - camera).double().cpu().numpy()
     far = np.linalg.norm(away, axis=1, keepdims=True)
     flipped = away * (2 * REACH * far.max() / far - 1)
-    corner = ConvexHull(np.vstack([flipped, np.zeros((1, 3))])).vertices
+    try:
+        corner = ConvexHull(np.vstack([flipped, np.zeros((1, 3))])).vertices
+    except QhullError:
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
     mask = torch.zeros(len(points) + 1, dtype=torch.bool)
     mask[torch.as_tensor(corner.astype(np.int64))] = True
     return mask[:-1].to(points.device)

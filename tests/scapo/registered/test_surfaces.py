@@ -92,6 +92,11 @@ def test_a_wall_hides_another() -> None:
     assert shown[:576].float().mean() < 0.1
 
 
+def test_points_in_one_plane_with_the_camera_are_all_seen() -> None:
+    line = F.pad(torch.linspace(-0.3, 0.3, 50)[:, None], (0, 2))
+    assert bool(seen(line, torch.tensor([0.0, 1.0, 0.0])).all())
+
+
 def test_what_the_shape_lacks_costs_no_more_than_far() -> None:
     near = 0.2 * normal(4, 1, 200, 3, dtype=torch.float32)
     assert misfit(near, near).item() < 0.01
