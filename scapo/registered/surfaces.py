@@ -98,7 +98,7 @@ def _said(
 
 
 def seen(points: Float[Tensor, "N 3"], camera: Float[Tensor, " 3"]) -> Bool[Tensor, " N"]:
-    """Which points a camera sees: hidden point removal. All, where they lie in one plane with it."""
+    """Which points a camera sees (hidden point removal); all that lie in one plane with it."""
     from scipy.spatial import ConvexHull, QhullError
 
     away = (points - camera).double().cpu().numpy()
