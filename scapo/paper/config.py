@@ -48,9 +48,10 @@ class ScapoConfig:
     """Training clouds that this run is asked for, about 0.06 s each on one core."""
     bones_turn: bool = False
     """V of a bone turns with its part (BANMo); otherwise it is the same in every state."""
-    labels_of: Literal["skinning", "template"] = "skinning"
-    """Whose weights a prediction gives: w of the bones on S_obj, or those of the nearest point of
-    the posed template, which ends at the hinge where two Gaussians do not."""
+    labels_of: Literal["skinning", "template", "told"] = "skinning"
+    """Whose weights a prediction gives: w of the bones on S_obj; those of the nearest point of the
+    posed template, which ends at the hinge where two Gaussians do not; or the part of which that
+    point was where stage 2 began, since no Gaussian is a door in front of its body."""
     encoder_in_stage_2: Literal["joint", "frozen", "end-to-end"] = "joint"
     """joint: frozen for the first half, then a tenth of the rate; end-to-end: all of it."""
     supervision: tuple[Literal["segmentation", "joint", "instance"], ...] = ()
@@ -150,6 +151,7 @@ def warm_config() -> ScapoConfig:
         preset="warm",
         loss=replace(lean.loss, recon_form="partial"),
         part_start="run",
+        labels_of="told",
         search=replace(lean.search, teaching=800),
         encoder_in_stage_2="end-to-end",
         epochs=(30, 6),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -208,10 +209,25 @@ class Template(nn.Module):
     (docs/method.md), so the template has its own.
     """
 
+    part: Tensor
+    """(N,) which part each point was of where stage 2 began; 0 where nobody said."""
+
     def __init__(self, points: int, parts: int) -> None:
         super().__init__()
         self.points = nn.Parameter(torch.zeros(points, 3))
         self.keypoints = nn.Parameter(torch.zeros(parts, 3))
+        self.register_buffer("part", torch.zeros(points, dtype=torch.long))
+
+    def _load_from_state_dict(
+        self,
+        state_dict: dict[str, Any],
+        prefix: str,
+        *rest: Any,  # noqa: ANN401 - as torch calls it
+        **named: Any,  # noqa: ANN401
+    ) -> None:
+        """Of a template that was saved without them nobody said parts."""
+        state_dict.setdefault(prefix + "part", self.part)
+        super()._load_from_state_dict(state_dict, prefix, *rest, **named)
 
     def reset(self, generator: torch.Generator) -> None:
         """Xavier uniform points, small random keypoints."""

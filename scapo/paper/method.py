@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -191,6 +192,7 @@ class Scapo(AbstractMethod):
         if config.part_start == "search":
             some = slice(config.search.taught)
             skeleton, own = self._searched(seen.align(clouds), medoid)
+            self.template.part.copy_(skeleton.weights().argmax(-1))
             self._teach(
                 skeleton, own, clouds[some], map_tensors(seen, lambda x: x[some]), generator
             )
@@ -198,6 +200,7 @@ class Scapo(AbstractMethod):
             told = self._warm().read(take(observation, chosen), chosen, seen)
             order = told.order(shape, medoid, self.kinds)
             skeleton = told.skeleton(order, config.search.spread)
+            self.template.part.copy_(told.part[0, order])
             self._teach(skeleton, told.lying(order, seen), clouds, seen, generator)
 
     def _warm(self) -> WarmStart:
@@ -361,7 +364,7 @@ class Scapo(AbstractMethod):
         The part frames are the template's: every part's pose carries the template onto the
         cloud. States are those of the cloud minus the template's. `refine` moves pose and joints
         of each cloud until the posed template fits it, `labels_of` takes the template's weights
-        (neither in the paper).
+        or parts (neither in the paper).
         """
         points, similarity = normalise(observation.points)
         explanation = self.explain(points)
@@ -373,7 +376,12 @@ class Scapo(AbstractMethod):
         state = joints.relative() - explanation.template_joints.relative()
         slide = torch.tensor([kind == "prismatic" for kind in self.kinds], device=state.device)
         scale, weights = similarity.scale[:, None], explanation.weights
-        if self.config.labels_of == "template":
+        if self.config.labels_of == "told":
+            told = F.one_hot(self.template.part, len(self.category.parts)).to(points)
+            explanation = replace(
+                explanation, template_weights=told.expand_as(explanation.template_weights)
+            )
+        if self.config.labels_of != "skinning":
             weights = nearest_template_weights(points, explanation, self.kinds)
         return Prediction(
             part_weight=weights,

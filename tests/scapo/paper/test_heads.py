@@ -104,6 +104,17 @@ def test_the_template_starts_at_random_and_takes_a_shape() -> None:
     assert_close(template.keypoints.detach(), keypoints)
 
 
+def test_of_a_template_from_before_nobody_said_parts() -> None:
+    template = art.Template(5, 2)
+    state = {name: value for name, value in template.state_dict().items() if name != "part"}
+    template.part.fill_(1)
+    template.load_state_dict(state)
+    assert template.part.tolist() == [1] * 5  # As it was: nothing else was there
+    fresh = art.Template(5, 2)
+    fresh.load_state_dict(state)
+    assert fresh.part.tolist() == [0] * 5
+
+
 def test_part_centroids_find_separate_clusters() -> None:
     centres = torch.tensor([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
     points = (centres[:, None] + 0.1 * normal(1, 3, 50, 3, dtype=torch.float32)).flatten(0, 1)

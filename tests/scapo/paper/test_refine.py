@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 from torch.testing import assert_close
 
 from scapo.categories import JointKind
@@ -82,3 +83,20 @@ def test_labels_of_the_template_are_those_of_its_nearest_point() -> None:
     expected = torch.stack([w[i] for w, i in zip(e.template_weights, index, strict=True)])
     assert_close(found, expected)
     assert not torch.equal(found, e.weights)
+
+
+def test_parts_that_were_told_are_those_of_the_nearest_point_as_they_pose_it() -> None:
+    """Whatever the bones say: a template of which the parts are told the other way round."""
+    model = tiny(config=replace(TINY, labels_of="told")).eval()
+    points = plates(3, 96)[0].points
+    with torch.no_grad():
+        cloud, _ = normalise(points)
+        e = model.explain(cloud)
+        model.template.part.copy_(e.template_weights[0].argmin(-1))
+        told = F.one_hot(model.template.part, 2).to(cloud).expand_as(e.template_weights)
+        posed = posed_template(replace(e, template_weights=told), model.kinds)
+    found = model.predict(Observation(points=points))
+    index = torch.cdist(cloud, posed).argmin(-1)
+    assert torch.equal(found.part_weight.argmax(-1), model.template.part[index])
+    assert found.canonical_part is not None
+    assert torch.equal(found.canonical_part[0], model.template.part)
