@@ -216,7 +216,7 @@ class Template(nn.Module):
         super().__init__()
         self.points = nn.Parameter(torch.zeros(points, 3))
         self.keypoints = nn.Parameter(torch.zeros(parts, 3))
-        self.register_buffer("part", torch.zeros(points, dtype=torch.long))
+        self.register_buffer("part", torch.zeros(points, dtype=torch.uint8))
 
     def _load_from_state_dict(
         self,

@@ -377,7 +377,7 @@ class Scapo(AbstractMethod):
         slide = torch.tensor([kind == "prismatic" for kind in self.kinds], device=state.device)
         scale, weights = similarity.scale[:, None], explanation.weights
         if self.config.labels_of == "told":
-            told = F.one_hot(self.template.part, len(self.category.parts)).to(points)
+            told = F.one_hot(self.template.part.long(), len(self.category.parts)).to(points)
             explanation = replace(
                 explanation, template_weights=told.expand_as(explanation.template_weights)
             )

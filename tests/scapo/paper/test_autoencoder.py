@@ -136,7 +136,7 @@ def test_one_hypothesis_is_never_exchanged() -> None:
 def test_votes_that_are_the_points_themselves_give_the_rotation_between_them() -> None:
     made, points = encoder(FORMS["votes"]).double(), 0.2 * normal(9, 3, 60, 3)
     turn = rotations(2, 3)
-    made.pose = nn.Identity()  # votes are what it is given
+    made.register_module("pose", nn.Identity())  # votes are what it is given
     frames = made.frames(points.mT, points, points @ turn.mT)
     assert_close(project(frames[:, 0], SMALL), turn)
 

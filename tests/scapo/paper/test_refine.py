@@ -93,10 +93,10 @@ def test_parts_that_were_told_are_those_of_the_nearest_point_as_they_pose_it() -
         cloud, _ = normalise(points)
         e = model.explain(cloud)
         model.template.part.copy_(e.template_weights[0].argmin(-1))
-        told = F.one_hot(model.template.part, 2).to(cloud).expand_as(e.template_weights)
+        told = F.one_hot(model.template.part.long(), 2).to(cloud).expand_as(e.template_weights)
         posed = posed_template(replace(e, template_weights=told), model.kinds)
     found = model.predict(Observation(points=points))
     index = torch.cdist(cloud, posed).argmin(-1)
-    assert torch.equal(found.part_weight.argmax(-1), model.template.part[index])
+    assert torch.equal(found.part_weight.argmax(-1), model.template.part.long()[index])
     assert found.canonical_part is not None
-    assert torch.equal(found.canonical_part[0], model.template.part)
+    assert torch.equal(found.canonical_part[0], model.template.part.long())

@@ -273,7 +273,7 @@ def test_both_stages_begin_at_a_run(run: Path) -> None:
     gap = torch.cdist(model.template.points, told.shape.mean(0)).amin(1)
     assert gap.max() < 1e-3  # each of its points is one that was told
     nearest_told = torch.cdist(model.template.points, told.shape.mean(0)).argmin(1)
-    assert torch.equal(model.template.part, told.part[0, nearest_told])
+    assert torch.equal(model.template.part.long(), told.part[0, nearest_told])
     assert set(model.template.part.tolist()) == {0, 1}
     terms = model.losses(observation, Labels(), replace(step, stage=ARTICULATE))
     assert "recon" in terms
