@@ -60,6 +60,11 @@ class EncoderConfig:
     """Rotations of a cloud, of which the one counts that brings it nearest to S_dec (as OP-Align
     chooses among 60; the paper has one)."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for no hypothesis at all."""
+        if self.hypotheses < 1:
+            raise ValueError(f"encoder: expected at least 1 hypothesis, found {self.hypotheses}")
+
     @property
     def code(self) -> int:
         """Length of Z_x: 2 * features vectors times 3 frame vectors."""

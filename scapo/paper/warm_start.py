@@ -176,7 +176,7 @@ class Exchange:
             return across[chosen], turns[chosen]
 
         if two:
-            rough, _ = best(_half_sphere(shape, HALF_TURNS**2 // 36))
+            rough, _ = best(_half_sphere(shape, WAYS))
             near = NEAR * _half_sphere(shape, HALF_TURNS)
             _, turn = best(F.normalize(rough + torch.cat([near, -near]), dim=-1))
         else:
@@ -186,6 +186,8 @@ class Exchange:
 
 HALF_TURNS = 120
 """Axes that are tried."""
+WAYS = 400
+"""Axes in all directions that are tried first."""
 NEAR = 0.1
 """Of axes in all directions: how far those that are tried next lie from the best."""
 APART = 10.0

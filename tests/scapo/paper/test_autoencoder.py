@@ -125,6 +125,11 @@ def test_of_the_hypotheses_the_one_counts_that_explains_a_cloud_best(name: str) 
         assert_close(found.frame, encoding.frames[[0, 1, 2], wanted])
 
 
+def test_a_cloud_without_a_hypothesis_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected at least 1 hypothesis, found 0"):
+        EncoderConfig(hypotheses=0)
+
+
 def test_one_hypothesis_is_never_exchanged() -> None:
     points = 0.2 * normal(9, 3, 60, 3)
     encoding = encoder(SMALL).double()(points)
