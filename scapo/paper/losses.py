@@ -228,9 +228,13 @@ def part_mass(weights: Float[Tensor, "B N P"], least: float = 0.05) -> Scalar:
     return F.relu(least - weights.mean((0, 1))).sum()
 
 
-def labelled_segmentation(weights: Float[Tensor, "B N P"], part: Int[Tensor, "B N"]) -> Scalar:
-    """Cross entropy with true parts, -1 ignored: the supervised variant of Table 2."""
-    return F.nll_loss(weights.clamp(min=1e-8).log().flatten(0, 1), part.flatten(), ignore_index=-1)
+def labelled_segmentation(
+    weights: Float[Tensor, "B N P"], part: Int[Tensor, "B N"]
+) -> Float[Tensor, " B"]:
+    """Cross entropy of each cloud with true parts, -1 ignored (Table 2, supervised variant)."""
+    logs = weights.clamp(min=1e-8).log().mT
+    error = F.nll_loss(logs, part, ignore_index=-1, reduction="none")
+    return error.sum(-1) / (part != -1).sum(-1).clamp_min(1)
 
 
 def labelled_joints(
@@ -238,7 +242,7 @@ def labelled_joints(
     axis: Float[Tensor, "B J 3"],
     true_pivot: Float[Tensor, "B J 3"],
     true_axis: Float[Tensor, "B J 3"],
-) -> Scalar:
-    """1 - |cos| of the axes and squared distance of the pivot from the true axis (Table 2)."""
+) -> Float[Tensor, " B"]:
+    """Of each cloud: 1 - |cos| of the axes and squared distance of the pivot from the true axis."""
     off = point_line_distance(pivot, true_pivot, true_axis).square()
-    return (1 - (axis * true_axis).sum(-1).abs()).mean() + off.mean()
+    return (1 - (axis * true_axis).sum(-1).abs() + off).mean(-1)

@@ -179,6 +179,7 @@ def test_supervised_terms() -> None:
     weights = t([0.25, 0.75], [0.5, 0.5])[None]
     part = torch.tensor([[1, -1]])
     assert losses.labelled_segmentation(weights, part).item() == pytest.approx(-math.log(0.75))
+    assert losses.labelled_segmentation(weights, -torch.ones_like(part)).item() == 0
     pivot, axis = t([[0, 0.3, 7]]), t([[0, 0, -1]])
     found = losses.labelled_joints(pivot, axis, t([[0, 0, 0]]), t([[0, 0, 1]]))
     assert found.item() == pytest.approx(0.09)
@@ -197,7 +198,7 @@ def test_all_terms_have_finite_gradients_at_a_perfect_fit() -> None:
         + losses.joint_proximity(pivot, points, neighbours=8)
         + losses.joint_boundary(pivot, points, weights, detach=False)
         + losses.joint_direction(axis, points, weights)
-        + losses.labelled_joints(pivot, axis, pivot.detach(), axis.detach())
+        + losses.labelled_joints(pivot, axis, pivot.detach(), axis.detach()).mean()
         + losses.shape_variance(points - points.detach())
     )
     total.backward()

@@ -15,6 +15,7 @@ from scapo.method import Step
 from scapo.paper.autoencoder import EncoderConfig
 from scapo.paper.config import ScapoConfig
 from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
+from scapo.records import map_tensors
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator, is_rotation, rigid_motions
@@ -190,8 +191,46 @@ def test_supervised_joints_do_not_depend_on_the_random_pose() -> None:
     assert_close(found[0], found[1], atol=1e-3, rtol=1e-3)
 
 
-def trained_supervised() -> Scapo:
-    model = tiny(config=replace(TINY, supervision=("joint",)))
+@pytest.mark.parametrize(("category", "either"), [("laptop", True), ("oven", False)])
+def test_supervised_terms_take_either_order_where_parts_exchange(
+    category: str, either: bool
+) -> None:
+    """Screen and base of a laptop change names and nothing changes; an oven's door is no body."""
+    observation, labels = plates(8, 96)
+    model = trained_supervised("segmentation", category=category)
+    assert labels.part is not None
+    found = [
+        model.losses(observation, Labels(part=part), at(ARTICULATE, 0.1, 1))[
+            "labelled_segmentation"
+        ].item()
+        for part in (labels.part, 1 - labels.part)
+    ]
+    assert (found[0] == pytest.approx(found[1], rel=1e-4)) == either
+
+
+def test_temples_change_places_with_their_hinges() -> None:
+    """The order is one for both terms: parts 1 and 2 go with joints 0 and 1."""
+    model = trained_supervised("segmentation", "joint", category="eyeglasses")
+    points = plates(4, 96)[0].points
+    part = torch.randint(3, (4, 96), generator=generator(2))
+    said = model.predict(Observation(points=points)).joints
+    assert said is not None
+
+    def total(names: list[int], order: list[int]) -> float:
+        joints = map_tensors(said, lambda x: x[:, order])
+        labels = Labels(part=torch.tensor(names)[part], joints=joints)
+        terms = model.losses(Observation(points=points), labels, at(ARTICULATE, 0.1, 1))
+        return sum(terms[name].item() for name in terms if name.startswith("labelled"))
+
+    assert total([0, 2, 1], [1, 0]) == pytest.approx(total([0, 1, 2], [0, 1]), rel=1e-3)
+    assert total([0, 1, 2], [1, 0]) != pytest.approx(total([0, 1, 2], [0, 1]), rel=1e-3)
+
+
+def trained_supervised(*labels: str, category: str = "laptop") -> Scapo:
+    config = replace(TINY, supervision=labels or ("joint",))  # pyright: ignore[reportArgumentType]
+    model = tiny(config=config, category=category)
+    if category == "eyeglasses":
+        return model.eval()
     model.load_state_dict(trained_state())
     model.eval()
     model._freeze = lambda step: None
