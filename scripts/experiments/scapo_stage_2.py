@@ -14,10 +14,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from torch import Generator
+
 import bench.__main__
 from scapo.method import Stage
 from scapo.paper.method import ARTICULATE, Scapo
 from scapo.store import checkpoint
+from scapo.types import Labels, Observation
 
 
 def main(base: Path, options: list[str]) -> None:
@@ -27,7 +30,10 @@ def main(base: Path, options: list[str]) -> None:
     def second(self: Scapo) -> tuple[Stage, ...]:
         return tuple(stage for stage in stages(self) if stage.name == ARTICULATE)
 
-    def start(self: Scapo, *_: object) -> None:
+    def start(
+        self: Scapo, stage: str, observation: Observation, labels: Labels, generator: Generator
+    ) -> None:
+        del stage, observation, labels, generator
         checkpoint.load_arrays(self, checkpoint.read_checkpoint(base)[0], base)
 
     Scapo.stages, Scapo.start = second, start

@@ -227,7 +227,7 @@ def test_temples_change_places_with_their_hinges() -> None:
 
 
 def trained_supervised(*labels: str, category: str = "laptop") -> Scapo:
-    config = replace(TINY, supervision=labels or ("joint",))  # pyright: ignore[reportArgumentType]
+    config = replace(TINY, supervision=labels or ("joint",))
     model = tiny(config=config, category=category)
     if category == "eyeglasses":
         return model.eval()
