@@ -64,7 +64,7 @@ class Step:
     reads: tuple[str, ...] = ()
     """Splits, PART/CATEGORY/SPLIT."""
     model: str = ""
-    """SHA-256 of the released model that it asks; "" where it asks one of this run."""
+    """SHA-256 of the released model that it asks or begins at; "" where there is none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,8 +77,6 @@ class Chain:
     """Of the method's configuration."""
     seed: int
     steps: tuple[Step, ...]
-    start: str = ""
-    """Label of what is trained, and scored, on the way."""
 
     @property
     def name(self) -> str:
@@ -163,8 +161,6 @@ class _Maker:
         self.grid: PresetName = name
         self.preset, self.folder = preset, folder
         self.configs: dict[str, Any] = {}
-        self.made: dict[str, Any] = {}
-        """Configurations, each without that of what it starts from."""
         self.data: dict[str, str | None] = {}
         self.counts: dict[str, int] = {}
         self.seconds: dict[tuple[str, str], float | None] = {}
@@ -176,49 +172,33 @@ class _Maker:
                 for entry in self.preset.entries:
                     if part in entry.parts and seed in entry.seeds:
                         for category in categories:
-                            if not entry.models or released_model(entry, part, category):
+                            names = entry.models or entry.start
+                            if not names or released_model(names, part, category):
                                 yield self.chain(entry, part, category, seed)
 
     def chain(self, entry: Entry, part: str, category: str, seed: int) -> Chain:
         """Training, then for each mode the frames and every split that is scored."""
         place = f"{part}/{category}"
-        trained = list(self.trainings(entry, place, seed))
-        steps = [step for step, _ in trained]
-        costs = {step.name: cost for step, cost in trained}
+        steps, costs = list[Step](), dict[str, float | None]()
+        if entry.models:
+            self.configs[entry.label] = {"method": entry.method, "models": list(entry.models)}
+        else:
+            step, costs["train"] = self.training(entry, place, seed)
+            steps.append(step)
         scored = [f"{place}/{split}" for split in self.preset.splits
                   if part != "isolated" or split != "test-ood"]  # fmt: skip
         if self.preset.sizes is None and "test" in self.preset.splits and self.has_real(place):
             scored.append(f"real/{category}/test")
-        for one in (entry,) if entry.start is None else (entry.start, entry):
-            for mode in one.modes:
-                for found, clouds in self.of_mode(one, mode, place, seed, scored):
-                    step = found if one is entry else of_start(found)
-                    steps.append(step)
-                    read = step.kind != "predict"
-                    each = SCORING / 1000 if read else one.seconds.get(mode, 0.0)
-                    costs[step.name] = START + clouds * each
+        for mode in entry.modes:
+            for step, clouds in self.of_mode(entry, mode, place, seed, scored):
+                steps.append(step)
+                read = step.kind != "predict"
+                each = SCORING / 1000 if read else entry.seconds.get(mode, 0.0)
+                costs[step.name] = START + clouds * each
         chain = Chain(part=part, category=category, label=entry.label, seed=seed,
-                      steps=tuple(steps),
-                      start="" if entry.start is None else entry.start.label)  # fmt: skip
+                      steps=tuple(steps))  # fmt: skip
         self.seconds |= {(chain.name, step): cost for step, cost in costs.items()}
         return chain
-
-    def trainings(self, entry: Entry, place: str, seed: int) -> Iterator[tuple[Step, float | None]]:
-        """The training, after the one that it starts from, with their estimates."""
-        if entry.models:
-            self.configs[entry.label] = {"method": entry.method, "models": list(entry.models)}
-            return
-        step, cost = self.training(entry, place, seed)
-        config = self.made[entry.label]
-        if entry.start is not None:
-            first, its = self.training(entry.start, place, seed)
-            config = {**config, "start": self.made[entry.start.label]}
-            yield of_start(first), its
-            run = Path(first.output).parent
-            step = replace(step, needs=(of_start(first).name,),
-                           command=(*step.command, "--start", f"{{out}}/{run}"))  # fmt: skip
-        self.configs.setdefault(entry.label, config)
-        yield step, cost
 
     def training(self, entry: Entry, place: str, seed: int) -> tuple[Step, float | None]:
         """The training of an entry into a run folder of its own, and its estimate."""
@@ -227,14 +207,18 @@ class _Maker:
         folder = f"runs/{part}/{name_of(entry, category, seed)}"
         preset, default = own_preset(entry.method, self.grid, entry.preset)
         flags = flags_of(entry, preset, self.preset.budget, clouds)
+        begun = released_model(entry.start, part, category)
         step = Step(
             kind="train", name="train", output=f"{folder}/checkpoint.safetensors",
             command=("train", entry.method, "--category", category, "--data", f"{{data}}/{part}",
-                     "--out", f"{{out}}/{folder}", "--seed", str(seed), "--resume", *flags),
-            reads=(f"{place}/train",),
+                     "--out", f"{{out}}/{folder}", "--seed", str(seed), "--resume", *flags,
+                     *(("--start", begun[0]) if begun else ())),
+            reads=(f"{place}/train",), model=sha256_file(begun[1]) if begun else "",
         )  # fmt: skip
-        if entry.label not in self.made:
-            self.made[entry.label] = configuration(entry.method, default, flags)
+        if entry.label not in self.configs:
+            config = configuration(entry.method, default, flags)
+            start = {"start": list(entry.start)} if begun else {}
+            self.configs[entry.label] = config | start
         return step, training_seconds(entry, flags, clouds)
 
     def of_mode(
@@ -243,7 +227,7 @@ class _Maker:
         """Predictions and scores of one mode, with the number of clouds of each step."""
         (part, category), frames = place.split("/"), ""
         name = name_of(entry, category, seed)
-        model = released_model(entry, part, category)
+        model = released_model(entry.models, part, category)
         if "pose" not in METHODS[entry.method].supervision and model is None:
             frames = f"predict-{mode}-train"
             limit = self.preset.calibration
@@ -315,17 +299,10 @@ def name_of(entry: Entry, category: str, seed: int) -> str:
     return f"{category}-{entry.label}-seed{seed}"
 
 
-def of_start(step: Step) -> Step:
-    """A step about what a chain starts from, beside the chain's own of the same name."""
-    return replace(
-        step, name=f"{step.name}-start", needs=tuple(f"{one}-start" for one in step.needs)
-    )
-
-
-def released_model(entry: Entry, part: str, category: str) -> tuple[str, Path] | None:
-    """Name and file of the released model that stands for an entry's training, if there is one."""
+def released_model(templates: Sequence[str], part: str, category: str) -> tuple[str, Path] | None:
+    """Name and file of the first released model of such names that is there."""
     known = weights()
-    names = [name.format(part=part, category=category) for name in entry.models]
+    names = [name.format(part=part, category=category) for name in templates]
     return next(((name, known[name]) for name in names if name in known), None)
 
 
@@ -371,12 +348,11 @@ def chosen(chains: Sequence[Chain], only: Sequence[str]) -> list[Chain]:
         patterns = item.split("/")
         fitting = [
             chain.name for chain in chains
-            if all(any(fnmatchcase(word, one) for word in (*chain.name.split("/"), chain.start))
+            if all(any(fnmatchcase(word, one) for word in chain.name.split("/"))
                    for one in patterns)
         ]  # fmt: skip
         if not fitting:
-            known = [label for chain in chains for label in (chain.start, chain.label) if label]
-            labels = ", ".join(dict.fromkeys(known))
+            labels = ", ".join(dict.fromkeys(chain.label for chain in chains))
             parts = ", ".join(dict.fromkeys(chain.part for chain in chains))
             raise ValueError(
                 f"only: expected parts ({parts}), categories, methods ({labels}), seed1, ... or "

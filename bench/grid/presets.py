@@ -39,8 +39,8 @@ class Entry:
     """Of this configuration in names of files; by default the method's."""
     preset: str = ""
     """Of the method; by default the one that goes with the grid's."""
-    start: Entry | None = None
-    """A training that comes first, is scored as well, and whose run `--start` names."""
+    start: tuple[str, ...] = ()
+    """Of the training: names of a released model that `--start` names, the first that is there."""
     models: tuple[str, ...] = ()
     """In place of a training: names of a released model, the first that is there."""
     flags: tuple[str, ...] = ()
@@ -99,17 +99,6 @@ NETWORKS = (
     Entry(method="scapo", name="scapo-isolated", rates=(115, 105), seconds={"fast": 0.01},
           parts=("isolated",)),
 )  # fmt: skip
-LABELLED = tuple(
-    Entry(method=method, name=f"{method}-sj", parts=("sensor",), rates=rates,
-          flags=("--supervision", "segmentation", "joint"), seconds={"fast": 0.02})
-    for method, rates in (("op-align", (34,)), ("scapo", (115, 105)))
-)  # fmt: skip
-"""The semi-supervised rows of Table 2."""
-ABLATIONS = tuple(
-    Entry(method="scapo", name=f"scapo-wo-{term}", parts=("clean",), rates=(115, 105),
-          flags=("--loss.without", term.replace("-", "_")), seconds={"fast": 0.01})
-    for term in ABLATED
-)  # fmt: skip
 REGISTERED = Entry(
     method="registered",
     seeds=THREE,
@@ -118,9 +107,6 @@ REGISTERED = Entry(
     training=2500,
     seconds={"fast": 0.05, "quick": 0.06, "refine": 0.35},
 )
-OBJECTS = replace(REGISTERED, name="registered-objects", seeds=(1,),
-                  flags=("--supervision", "instance"))  # fmt: skip
-"""Told which training clouds show the same object; trained and scored in the chain of `WARM`."""
 RELEASED = replace(REGISTERED, name="released", seeds=(1,), training=0,
                    models=("{category}/{part}", "{category}"))  # fmt: skip
 """What users get: the models that come with the package, in the frame that they answer in."""
@@ -129,11 +115,31 @@ WHOLE = replace(RELEASED, parts=("complete",), modes=("whole",), seconds={"whole
 BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("refine",),
               training=300, seconds={"refine": 0.35})  # fmt: skip
 """What its search can do at best, with a template of true placements."""
-WARM = Entry(method="scapo", name="scapo-warm", preset="warm", start=OBJECTS,
-             flags=OBJECTS.flags, parts=("clean", "sensor"), training=1200,
+WARM = Entry(method="scapo", name="scapo-warm", preset="warm", seeds=THREE, start=RELEASED.models,
+             flags=("--supervision", "instance"), parts=("clean", "sensor"), training=800,
              seconds={"fast": 0.01})  # fmt: skip
-"""The paper's networks, begun at what template registration says: SCAPO, warm start."""
-GRID = (*NETWORKS, *LABELLED, RELEASED, WHOLE, REGISTERED, WARM, BOUND, *ABLATIONS)
+"""The paper's networks, begun at what a released model says, which was told which clouds show the
+same object: SCAPO, warm start."""
+WARM_WHOLE = replace(
+    WARM, name="scapo-warm-complete", parts=("complete",), seeds=(1,), training=1500,
+    flags=(*WARM.flags, "--loss.recon-form", "squared", "--told-of", "surfaces", "--told", "1000",
+           "--epochs", "60", "6"),
+)  # fmt: skip
+"""The same on whole surfaces."""
+LABELLED = (
+    Entry(method="op-align", name="op-align-sj", parts=("sensor",), rates=(34,),
+          flags=("--supervision", "segmentation", "joint"), seconds={"fast": 0.02}),
+    replace(WARM, name="scapo-warm-sj", parts=("sensor",), seeds=(1,),
+            flags=("--supervision", "segmentation", "joint", "instance")),
+)  # fmt: skip
+"""The semi-supervised rows of Table 2."""
+ABLATIONS = tuple(
+    replace(WARM, name=f"scapo-wo-{term}", parts=("clean",), seeds=(1,),
+            flags=(*WARM.flags, "--loss.without", term.replace("-", "_")))
+    for term in ABLATED
+)  # fmt: skip
+"""Of Table 3, in the setting in which the method works on single views."""
+GRID = (*NETWORKS, RELEASED, WHOLE, REGISTERED, WARM, WARM_WHOLE, *LABELLED, BOUND, *ABLATIONS)
 
 PRESETS: Mapping[PresetName, Preset] = {
     "smoke": Preset(
@@ -176,7 +182,7 @@ def flags_of(entry: Entry, preset: str | None, minutes: float | None, clouds: in
 
 def training_seconds(entry: Entry, flags: list[str], clouds: int) -> float | None:
     """The estimate for a training with such flags; None where nothing was measured."""
-    if "--epochs" not in flags:
+    if not entry.rates or "--epochs" not in flags:
         return entry.training
     epochs = map(int, flags[flags.index("--epochs") + 1 :])
     return sum(count * clouds / rate for count, rate in zip(epochs, entry.rates, strict=True))

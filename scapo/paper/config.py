@@ -40,7 +40,8 @@ class ScapoConfig:
     search: SearchConfig = field(default_factory=SearchConfig)
     """Used with `part_start` search; `spread` and `teaching` with run too."""
     start: str | None = None
-    """Run folder of a trained `registered` of the same category, for `part_start` run."""
+    """A trained `registered` of the same category, for `part_start` run: its run folder, its
+    checkpoint or a released model's name."""
     told_of: Literal["views", "surfaces"] = "views"
     """What the clouds show: one side of an object, as that run's clouds do, or the whole of it,
     which it is then shown from many sides (0.25 s each)."""

@@ -15,7 +15,6 @@ What OP-Align's released evaluator asks of a network (`record_*`, docs/bring-you
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -209,10 +208,10 @@ class Scapo(AbstractMethod):
         if self._run is None:
             if self.config.start is None:
                 raise ValueError(
-                    "--start: expected the run folder of a trained `registered`, found none; "
+                    "--start: expected a trained `registered`, run folder or name, found none; "
                     "`scapo-bench train registered --category C --data DIR --out RUN` makes one"
                 )
-            run = load_run(Path(self.config.start), self.category)
+            run = load_run(self.config.start, self.category)
             hidden = " ".join(sorted(run.supervision - self.supervision))
             if hidden:  # what the run learned from, this training learns from too
                 raise ValueError(

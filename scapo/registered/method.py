@@ -40,6 +40,7 @@ from scapo.registered.discovery import Discovery, discover
 from scapo.registered.objects import ObjectViews, grouped
 from scapo.registered.template import Placement
 from scapo.registered.views import PartialViews
+from scapo.released import find
 from scapo.store.checkpoint import (
     check_header,
     config_from,
@@ -78,7 +79,7 @@ class TemplateRegistration(AbstractRegistered):
         if self.config.start is None or stage != FIRST:
             super().start(stage, observation, labels, generator)
             return
-        known = load_run(Path(self.config.start), self.category)
+        known = load_run(self.config.start, self.category)
         if left := known.supervision - self.supervision:
             raise ValueError(
                 f"start: {self.config.start} was told {', '.join(left)}; "
@@ -148,12 +149,13 @@ class TemplateRegistration(AbstractRegistered):
         return placed_prediction(self.template, placement, part_weight, similarity, confidence)
 
 
-def load_run(path: Path, category: Category) -> TemplateRegistration:
-    """The trained model of a `registered` run folder or checkpoint file.
+def load_run(name: str | Path, category: Category) -> TemplateRegistration:
+    """The trained model of a `registered` run folder or checkpoint file, or a released one's.
 
     Raises:
         StoreError: None there, of another method, or of another category.
     """
+    path = find(name)
     arrays, header = read_checkpoint(path)
     kind = header_category(check_header(header, str(path)), str(path))
     if header["method"] != TemplateRegistration.name or kind != category:

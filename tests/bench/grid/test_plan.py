@@ -17,6 +17,7 @@ from bench.grid.presets import PRESETS, REAL, flags_of, training_seconds
 from bench.methods import METHODS
 from bench.tables.spec import TABLE_1_CATEGORIES, TABLE_2_CATEGORIES
 from scapo.store import StoreError
+from scapo.store.files import sha256_file
 from tests.helpers.grids import make_splits, plan_of
 from tests.helpers.made import make_data
 
@@ -39,31 +40,28 @@ def test_the_grid_has_every_method_of_every_table(cpu: Plan):
     assert [cpu.configs[label]["config"]["loss"]["without"] for label in sorted(ablated)] == [
         ["dir_align"], ["joint_boundary"], ["joint_prox"], ["shape_var"]
     ]  # fmt: skip
-    assert cpu.configs["scapo-sj"]["config"]["supervision"] == ["segmentation", "joint"]
+    assert cpu.configs["scapo-warm-sj"]["config"]["supervision"] == [
+        "segmentation", "joint", "instance"
+    ]  # fmt: skip
 
 
-def test_a_warm_start_has_a_run_of_its_own_to_begin_at(cpu: Plan):
-    chain = next(c for c in cpu.chains if c.label == "scapo-warm" and c.part == "clean")
-    first, second = chain.steps[:2]
-    assert first.command[:2] == ("train", "registered")
-    assert second.command[:2] == ("train", "scapo")
-    out = first.command[first.command.index("--out") + 1]
-    assert second.command[second.command.index("--start") + 1] == out
-    assert first.output == out.removeprefix("{out}/") + "/checkpoint.safetensors"
-    assert second.needs == (first.name,)
-    config = cpu.configs["scapo-warm"]
-    assert config["config"]["part_start"] == "run"
-    assert config["start"]["method"] == "registered"
-    assert cpu.seconds[chain.name, first.name] == 2500
-    run = Path(first.output).parent.name
-    told = [s for s in chain.steps if s.name.endswith("-start") and s.kind == "predict"]
-    assert {s.command[1].rpartition("/")[2] for s in told} == {run}
-    assert {s.command[s.command.index("--mode") + 1] for s in told} == {"fast", "quick", "refine"}
-    own = [s for s in chain.steps if s.kind == "predict" and s not in told]
-    assert all(run not in s.command[1] and s.needs == ("train",) for s in own)
-    assert chain in chosen(cpu.chains, ["registered-objects"])
-    assert chain in chosen(cpu.chains, ["scapo-warm"])
-    assert all("registered-objects" in c.start for c in chosen(cpu.chains, ["*objects"]))
+def test_a_warm_start_begins_at_a_released_model(tmp_path: Path, monkeypatch):
+    models = {name: tmp_path / name.replace("/", "-") for name in ("oven", "laptop/sensor")}
+    for name, path in models.items():
+        path.write_text(name)
+    monkeypatch.setattr("bench.grid.plan.weights", lambda: models)
+    plan = make_plan("cpu", tmp_path)
+    begun = [c for c in plan.chains if c.label.startswith(("scapo-warm", "scapo-wo-"))]
+    assert {c.name.partition("/")[0] for c in begun} == {"clean", "complete", "sensor"}
+    for chain in begun:
+        train = chain.steps[0]
+        name = "oven" if chain.category == "oven" else "laptop/sensor"
+        assert train.command[:2] == ("train", "scapo")
+        assert train.command[-2:] == ("--start", name)
+        assert train.model == sha256_file(models[name])
+    assert plan.configs["scapo-warm"]["config"]["part_start"] == "run"
+    assert plan.configs["scapo-warm"]["start"] == ["{category}/{part}", "{category}"]
+    assert plan.configs["scapo-warm-complete"]["config"]["told_of"] == "surfaces"
 
 
 def test_every_output_is_made_once_and_every_need_is_met_before(cpu: Plan):

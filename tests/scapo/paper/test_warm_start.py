@@ -303,7 +303,7 @@ def test_a_run_is_asked_about_what_the_clouds_show(
 
 def test_a_start_that_cannot_be_is_refused(run: Path, tmp_path: Path) -> None:
     observation = oracle()[1]
-    with pytest.raises(ValueError, match="--start: expected the run folder of a trained"):
+    with pytest.raises(ValueError, match="--start: expected a trained `registered`"):
         warm(None).start(CANONICALISE, observation, Labels(), generator(1))
     with pytest.raises(StoreError, match="expected a file, found none"):
         warm(tmp_path).start(CANONICALISE, observation, Labels(), generator(1))
