@@ -21,7 +21,7 @@ from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import NO_JOURNAL, AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
 from scapo.pictures import PictureData
-from scapo.records import cat, take
+from scapo.records import cat, map_tensors, take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import SearchConfig
 from scapo.registered.decode import metric_limits, nearest_weights
@@ -152,7 +152,7 @@ class AbstractRegistered(AbstractMethod):
     ) -> None:
         """Find the template, and its placement in the clouds that the network will learn."""
         if stage != FIRST:
-            self._place(observation.points, generator)
+            self._place(observation.points, labels, generator)
             return
         if len(observation.points) < LEAST_CLOUDS:
             raise ValueError(
@@ -173,17 +173,18 @@ class AbstractRegistered(AbstractMethod):
         self.pseudo.belonging = inlier
         self._learn_orientation(views, made, seed)
         self.to(device)
-        self._place(observation.points, generator, LATE)
+        self._place(observation.points, labels, generator, LATE)
 
     def _place(
-        self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator, begun: float = 0.0
+        self,
+        cloud: Float[Tensor, "B N 3"],
+        labels: Labels,
+        generator: torch.Generator,
+        begun: float = 0.0,
     ) -> None:
         """Find on the host what the network learns, as `quick` would: a few candidates of each.
 
-        Args:
-            cloud: All training clouds.
-            generator: Of the training.
-            begun: Share of the start that is over before.
+        `begun` is the share of the start that is over before.
         """
         if not isinstance(self.network, ViewNetwork):
             return
@@ -192,21 +193,25 @@ class AbstractRegistered(AbstractMethod):
         self.eval()  # it is asked, and learns nothing yet
         self.targets.clear()
         index = evenly(len(cloud), self.config.placed).to(cloud.device)
+        cloud, labels = cloud[index].cpu(), map_tensors(take(labels, index), Tensor.cpu)
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
         makers = {kind.__name__: kind for kind in (Candidates, Placement)}
         parts, total = list[Candidates](), len(index)
-        jobs = [partial(self._candidates_of_all, some) for some in cloud[index].cpu().split(KEPT)]
+        jobs = [partial(self._candidates_of_all, some) for some in cloud.split(KEPT)]
         for done, make in zip(range(0, total, KEPT), self.journal.ahead(jobs), strict=True):
             share = begun + (1 - begun) * done / total
             self.journal.tell(f"placing clouds, {done} of {total}", share, PLACING * (total - done))
             parts.append(self.journal.once(f"placed clouds from {done} on", make, host, makers))
-        found = cat(parts)
-        trust = torch.zeros_like(found.margin)
-        count = max(1, round(self.config.trusted * len(trust)))
-        trust[found.margin.topk(count).indices] = 1.0
-        self.targets.set(found, trust)
+        self.targets.set(*self._trusted(cat(parts), cloud, labels, host))
         self.network.learned.fill_(1.0)
         self.to(device)
+
+    def _trusted(
+        self, found: Candidates, cloud: Tensor, labels: Labels, generator: torch.Generator
+    ) -> tuple[Candidates, Float[Tensor, " B"]]:
+        """What is learned of clouds, and the weight of each: the surest."""
+        del cloud, labels, generator
+        return found, found.surest(self.config.trusted)
 
     def _candidates_of_all(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
         return cat([self._candidates(some) for some in cloud.split(PLACED)])

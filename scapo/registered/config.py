@@ -151,6 +151,10 @@ class RegisteredConfig(SearchConfig):
     start: str | None = None
     """A run or checkpoint of the same category whose template, and what it learned of views, is
     taken, so that the network alone is trained. None: a template is found."""
+    stand: Literal["views", "objects"] = "views"
+    """What of the candidates the network learns: the best of each view, or, where it is known which
+    clouds show the same object and no symmetry exchanges its parts, those that stand as the object
+    does in all of its views."""
     preset: Literal["cpu", "quick"] = "cpu"
     """Where the other defaults come from; quick: a training of two minutes, for trying things."""
 

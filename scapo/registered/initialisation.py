@@ -11,7 +11,7 @@ from itertools import product
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
@@ -21,7 +21,7 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.gauge import principal_frame
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
 from scapo.registered.pairwise import HIDDEN_COST, register_pairs, rotation_grid
-from scapo.registered.synchronisation import synchronise
+from scapo.registered.synchronisation import Synchronised, synchronise
 from scapo.registered.template import ArticulatedTemplate, Placement, spread_out, surface_features
 from scapo.registered.views import PartialViews
 
@@ -44,12 +44,8 @@ def common_frame(
         share: Of the views.
         hidden_cost: Of `register_pairs`.
     """
-    count = len(views.points)
-    pairs = torch.combinations(torch.arange(count)).flip(-1)
-    grid = rotation_grid(rotations)
-    modes = register_pairs(views, pairs, rotations=grid, hidden_cost=hidden_cost)
-    poses = synchronise(count, pairs, modes)
-    kept = poses.confidence.topk(max(LEAST_VIEWS, round(share * count))).indices
+    poses = registered_together(views, rotations, hidden_cost)
+    kept = surest_of(poses, share)
     views, poses = take(views, kept), take(poses, kept)
     rotation, translation = poses.rotation, poses.translation
     normals = views.normals[:, ::FRAME_EVERY] @ rotation.mT
@@ -61,6 +57,21 @@ def common_frame(
     return PosedViews(
         views=views, rotation=back, translation=-(back @ translation[..., None])[..., 0]
     )
+
+
+def registered_together(views: PartialViews, rotations: int, hidden_cost: float) -> Synchronised:
+    """The poses of views on which their registrations with one another agree."""
+    count = len(views.points)
+    pairs = torch.combinations(torch.arange(count)).flip(-1)
+    grid = rotation_grid(rotations)
+    modes = register_pairs(views, pairs, rotations=grid, hidden_cost=hidden_cost)
+    return synchronise(count, pairs, modes)
+
+
+def surest_of(poses: Synchronised, share: float) -> Int[Tensor, " K"]:
+    """Which views are that share whose poses are surest."""
+    count = len(poses.confidence)
+    return poses.confidence.topk(max(LEAST_VIEWS, round(share * count))).indices
 
 
 def fitted_proposals(

@@ -22,22 +22,36 @@ tell, and where it believes the camera is there `quick` and `refine` take it to 
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import Category
 from scapo.geometry.points import Similarity
 from scapo.method import changes
-from scapo.registered.base import FIRST, LATE, AbstractRegistered, LearnedClouds
+from scapo.records import cat
+from scapo.registered.base import FIRST, LATE, PLACING, AbstractRegistered, LearnedClouds
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig
 from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
-from scapo.registered.objects import ObjectViews, grouped
+from scapo.registered.learning import candidates
+from scapo.registered.objects import LEAST_OBJECTS, ObjectViews, grouped
+from scapo.registered.pose_search import BRIEF, CHARGED, successive_halving
+from scapo.registered.pseudo_labels import Candidates
+from scapo.registered.standing import (
+    ObjectFrame,
+    against,
+    agreeing,
+    exchanged,
+    frame_of,
+    how_objects_stand,
+    rows_by_object,
+)
 from scapo.registered.template import Placement
 from scapo.registered.views import PartialViews
 from scapo.released import find
@@ -53,6 +67,9 @@ from scapo.types import Labels, Observation, Prediction, Supervision
 
 logger = logging.getLogger(__name__)
 
+FRAME = 3.5  # Seconds of one core for an object's views that are registered with one another
+TURNED = 50  # Clouds that are placed at a time as their objects stand
+
 
 class TemplateRegistration(AbstractRegistered):
     """Template registration: the template is discovered, without labels of poses or parts."""
@@ -65,6 +82,7 @@ class TemplateRegistration(AbstractRegistered):
     ) -> None:
         """A method whose template is still empty."""
         super().__init__(config, category, generator)
+        self._frames: list[ObjectFrame] | None = None
         self.supervision: frozenset[Supervision] = frozenset(config.supervision)
 
     def start(
@@ -96,7 +114,7 @@ class TemplateRegistration(AbstractRegistered):
         sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
         if sizes[0] == sizes[1]:
             self.network.load_state_dict(known.network.state_dict())
-        self._place(observation.points, generator, LATE)
+        self._place(observation.points, labels, generator, LATE)
 
     @property
     def variant(self) -> str:
@@ -132,6 +150,60 @@ class TemplateRegistration(AbstractRegistered):
             if not known:
                 logger.warning("too few clouds of any one object: which show the same is not used")
         return discover(learned.views, kinds, config, generator, objects, self.journal)
+
+    def _trusted(
+        self, found: Candidates, cloud: Tensor, labels: Labels, generator: torch.Generator
+    ) -> tuple[Candidates, Float[Tensor, " B"]]:
+        """The clouds that stand as their objects do, if these are asked (`standing`)."""
+        known = [] if labels.instance is None else rows_by_object(labels.instance)
+        alike = self.category.symmetry is not None
+        if self.config.stand == "views" or alike or len(known) < LEAST_OBJECTS:
+            return super()._trusted(found, cloud, labels, generator)
+        if self._frames is None:
+            self._frames = self._frames_of(cloud, known, generator)
+        ways = how_objects_stand(found, self._frames)
+        agrees = agreeing(found, self._frames, ways)[1]
+        row, wanted = against(agrees, self._frames, ways)
+        said = "%.0f %% of the clouds stand as their objects do; %d more are asked whether they may"
+        logger.info(said, 100 * agrees.float().mean(), len(row))
+        if len(row):
+            other = self._turned(cloud[row], wanted, generator)
+            found = exchanged(found, row, other)
+        found, agrees = agreeing(found, self._frames, ways)
+        return found, agrees.to(found.gap)
+
+    def _frames_of(
+        self, cloud: Tensor, known: list[Int[Tensor, " V"]], generator: torch.Generator
+    ) -> list[ObjectFrame]:
+        """Of each object, from registrations of its views with one another."""
+        rotations = self.config.discovery.rotations
+        jobs = [partial(frame_of, row, self._of_one_size(cloud[row]), rotations) for row in known]
+        frames, makers = list[ObjectFrame](), {"ObjectFrame": ObjectFrame}
+        for k, make in enumerate(self.journal.ahead(jobs)):
+            self.journal.tell(f"object {k} of {len(jobs)}", 1.0, FRAME * (len(jobs) - k))
+            frames.append(self.journal.once(f"frame of object {k}", make, generator, makers))
+        return frames
+
+    def _turned(
+        self, cloud: Tensor, wanted: Float[Tensor, "B 3 3"], generator: torch.Generator
+    ) -> Candidates:
+        """Candidates of clouds in which the template is turned as wanted."""
+        pairs = zip(cloud.split(TURNED), wanted.split(TURNED), strict=True)
+        jobs = [partial(self._some_turned, *pair) for pair in pairs]
+        found, makers = list[Candidates](), {x.__name__: x for x in (Candidates, Placement)}
+        for k, make in enumerate(self.journal.ahead(jobs)):
+            self.journal.tell("placing clouds as objects stand", 1.0, PLACING * TURNED * len(jobs))
+            found.append(self.journal.once(f"turned clouds, {k}", make, generator, makers))
+        return cat(found)
+
+    def _some_turned(
+        self, cloud: Float[Tensor, "B N 3"], wanted: Float[Tensor, "B 3 3"]
+    ) -> Candidates:
+        seen, space = self._seen(Observation(points=cloud)), self._space()
+        number = self.config.quick_hypotheses
+        start = space.rendered.turned(seen.views, seen.frame @ wanted, number)
+        left = successive_halving(self.template, seen.views, start, space, BRIEF)
+        return candidates(self.template, seen, left, self._limits().wider(CHARGED))
 
     def _of_one_size(self, cloud: Float[Tensor, "B N 3"]) -> PartialViews:
         """Clouds of one object, normalised all alike: it is as large in all of them."""

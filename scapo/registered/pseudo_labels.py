@@ -30,6 +30,12 @@ class Candidates:
     normals: Int8[Tensor, "B N 3"]
     """In the frame of the placements, times 127."""
 
+    def surest(self, share: float) -> Float[Tensor, " B"]:
+        """1 for that share of the clouds that are to be trusted most, 0 for others."""
+        count = max(1, round(share * len(self.margin)))
+        kept = self.margin.topk(count).indices
+        return torch.zeros_like(self.margin).index_fill(0, kept, 1.0)
+
 
 class _Tensors(nn.Module):
     """Named tensors whose size is that of what was stored."""

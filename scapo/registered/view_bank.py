@@ -23,7 +23,7 @@ from torch import Tensor
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.geometry.rigid import rotation_between
 from scapo.records import cat, take
-from scapo.registered.pairwise import distinct
+from scapo.registered.pairwise import distinct, within
 from scapo.registered.template import ArticulatedTemplate, Placement, slides
 from scapo.registered.view_loss import GRAZING
 from scapo.registered.views import FAR, TINY, PartialViews
@@ -43,6 +43,7 @@ surface in a cell a point is hidden."""
 DISTANCE = 2.0  # Normalised length from the template's middle to its cameras
 SHORTLIST = 4  # Rotations that are told apart for each hypothesis that is kept
 SPACED = 22.0  # Degrees between hypotheses that are kept
+WANTED = 15.0  # Degrees from a rotation that is asked for
 CHUNK = 8  # Views that are compared at once
 ALIKE, SAME_SIDE = 4, 0.9
 """Placed views that a view is compared with, those most like it, and the cosine of directions
@@ -165,6 +166,33 @@ class ViewBank:
         return self._placement(
             rotation[rows, best], (direction.gather(1, best), mode), middle, radius
         )
+
+    @torch.no_grad()
+    def turned(self, views: PartialViews, wanted: Float[Tensor, "B 3 3"], keep: int) -> Placement:
+        """What looks most like each view of what is turned as wanted, those of a view in a row.
+
+        Args:
+            views: B views.
+            wanted: view_R_template.
+            keep: Placements of each view.
+        """
+        parts = torch.arange(len(views.points), device=views.points.device).split(CHUNK)
+        return cat([self._turned(take(views, index), wanted[index], keep) for index in parts])
+
+    def _turned(self, views: PartialViews, wanted: Float[Tensor, "B 3 3"], keep: int) -> Placement:
+        middle, seen, radius = ShownPoints.of(views).about_centroid()
+        about = rolls().to(seen) @ views.look[:, None]  # (B, R, 3, 3)
+        cost = self.distances(_drawn(seen, views.normals[:, :POINTS], about))  # (B, R, V, M)
+        rotation = about[:, :, None].mT @ self.look  # (B, R, V, 3, 3)
+        trace = (rotation * wanted[:, None, None]).sum((-1, -2))
+        near = within(trace, WANTED) | (trace == trace.amax((1, 2), keepdim=True))
+        cost = cost.masked_fill(~near[..., None], torch.inf)
+        best = cost.flatten(1).topk(keep, largest=False).indices
+        mode = best % cost.shape[3]
+        direction = best // cost.shape[3] % cost.shape[2]
+        roll = best // (cost.shape[3] * cost.shape[2])
+        rows = torch.arange(len(seen), device=best.device)[:, None]
+        return self._placement(rotation[rows, roll, direction], (direction, mode), middle, radius)
 
     def _placement(
         self,
