@@ -21,6 +21,7 @@ from scapo.registered.view_bank import (
     SPLATTED,
     UNLIKE,
     UNLIKE_WEIGHT,
+    WANTED,
     ShownPoints,
     ViewBank,
     draw,
@@ -194,3 +195,17 @@ def test_a_placed_view_is_not_compared_with_itself():
     assert odd[0, 0].item() == pytest.approx(UNLIKE * UNLIKE_WEIGHT)
     stranger = replace(bank, key=None).unlikeness(views, truth.rotation[:, None])
     assert stranger[0, 0].item() == pytest.approx(0, abs=1e-5)
+
+
+def test_what_is_turned_as_wanted_has_the_state_that_looks_alike():
+    views, truth = sighted(16, seed=43)
+    bank = ViewBank.rendered(template(), still(torch.linspace(0, 1, 5)[:, None]), None)
+    found = bank.turned(views, truth.rotation, 3)
+    rotation = found.rotation.unflatten(0, (16, 3))
+    apart = rotation_angle(rotation, truth.rotation[:, None].expand_as(rotation)).rad2deg()
+    assert apart.max() < WANTED + 5  # the nearest of the bank's, where none is as near
+    off = (found.state.view(16, 3) - truth.state).abs()
+    assert off[:, 0].median() < 0.2
+    upside_down = truth.rotation @ torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    other = bank.turned(views, upside_down, 1)
+    assert rotation_angle(other.rotation, upside_down).rad2deg().max() < WANTED + 5
