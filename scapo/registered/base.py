@@ -454,7 +454,7 @@ class AbstractRegistered(AbstractMethod):
         if beside:
             start = interleave([start, space.propose(views, beside)], len(views.points))
         left = successive_halving(self.template, views, start, space, effort)
-        charge = dissent(self.template, said, sure, left.placement)
+        charge = dissent(self.template, said, sure, left.placement, self.config.dissent)
         return replace(left, unlike=left.unlike + charge)
 
     def _without_network(self, views: PartialViews, count: int) -> Placement:

@@ -128,6 +128,9 @@ class SearchConfig:
     """Such placements with which the search begins before there is a network."""
     strays: Literal["out", "kept"] = "out"
     """Whether outliers, points that do not belong to the object, are left out."""
+    dissent: float = 0.2
+    """Loss that a part of a hypothesis costs which is turned another way than the network says,
+    where the network's votes agree."""
     settle: bool = True
     """Try all states again for the placement that won."""
     camera: Literal["known", "estimated"] = "known"

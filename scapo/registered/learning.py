@@ -42,9 +42,7 @@ from scapo.registered.views import PartialViews, surface_normals
 NOISE = 0.003  # Normalised length: standard deviation of the points' noise while a network learns
 SAMPLED = 2  # Times `count` points that are drawn from a cloud, of which the farthest are learned
 THINNED = 0.2  # Share of a cloud's points that the network may not be shown in a step
-DISSENT, OTHER_WAY = 0.2, 0.4
-"""Loss that a part costs which a hypothesis turns another way than the network says, and from about
-which angle on it does, rad."""
+OTHER_WAY = 0.4  # Rad: from about there on a part is turned another way than the network says
 UNIT = 127  # Of stored normals
 PRICE = 5.0  # Of a unit of loss by which the search prefers another candidate, in the network's
 
@@ -225,6 +223,7 @@ def dissent(
     said: Placement,
     sure: Float[Tensor, " B"],
     hypotheses: Placement,
+    price: float,
 ) -> Float[Tensor, "B F"]:
     """What hypotheses cost whose parts lie another way than the network says, by how sure it is.
 
@@ -233,8 +232,9 @@ def dissent(
         said: The network's placement of B views.
         sure: 1 where its votes agree, to 0.
         hypotheses: F of each, those of a view in a row.
+        price: Loss that a part costs which is turned another way.
     """
     own = template.part_poses(said).rotation[:, None]  # (B, 1, P, 3, 3)
     other = template.part_poses(hypotheses).rotation.unflatten(0, (len(sure), -1))
     apart = rotation_angle(other, own.expand_as(other))
-    return sure[:, None] * (DISSENT * (1 - torch.exp(-(apart / OTHER_WAY).square()))).sum(-1)
+    return price * sure[:, None] * (1 - torch.exp(-(apart / OTHER_WAY).square())).sum(-1)

@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from scapo.geometry.rigid import rotation_angle
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
-from scapo.registered.learning import DISSENT, UNIT, dissent, taught, undeviated
+from scapo.registered.learning import UNIT, dissent, taught, undeviated
 from scapo.registered.view_network import ViewNetwork
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
@@ -68,11 +68,11 @@ def test_parts_that_lie_another_way_than_the_network_says_cost() -> None:
             )
         ]
     )
-    cost = dissent(shape, truth, torch.tensor([1.0, 0.5]), hypotheses)
+    cost = dissent(shape, truth, torch.tensor([1.0, 0.5]), hypotheses, 0.3)
     assert_close(cost[:, 0], torch.zeros(2), atol=1e-5, rtol=0)
-    assert bool((cost[:, 1] < 0.1 * DISSENT).all())
-    assert_close(cost[:, 2], DISSENT * torch.tensor([1.0, 0.5]), atol=1e-4, rtol=0)
-    assert_close(cost[:, 3], 2 * DISSENT * torch.tensor([1.0, 0.5]), atol=1e-4, rtol=0)
+    assert bool((cost[:, 1] < 0.03).all())
+    assert_close(cost[:, 2], 0.3 * torch.tensor([1.0, 0.5]), atol=1e-4, rtol=0)
+    assert_close(cost[:, 3], 0.6 * torch.tensor([1.0, 0.5]), atol=1e-4, rtol=0)
 
 
 def test_a_search_begins_about_the_axes_of_the_category() -> None:
