@@ -180,7 +180,8 @@ class TemplateRegistration(AbstractRegistered):
         jobs = [partial(frame_of, row, self._of_one_size(cloud[row]), rotations) for row in known]
         frames, makers = list[ObjectFrame](), {"ObjectFrame": ObjectFrame}
         for k, make in enumerate(self.journal.ahead(jobs)):
-            self.journal.tell(f"object {k} of {len(jobs)}", 1.0, FRAME * (len(jobs) - k))
+            left = FRAME * (len(jobs) - k)
+            self.journal.tell(f"object {k} of {len(jobs)}", k / len(jobs), left)
             frames.append(self.journal.once(f"frame of object {k}", make, generator, makers))
         return frames
 
@@ -192,7 +193,8 @@ class TemplateRegistration(AbstractRegistered):
         jobs = [partial(self._some_turned, *pair) for pair in pairs]
         found, makers = list[Candidates](), {x.__name__: x for x in (Candidates, Placement)}
         for k, make in enumerate(self.journal.ahead(jobs)):
-            self.journal.tell("placing clouds as objects stand", 1.0, PLACING * TURNED * len(jobs))
+            left = PLACING * TURNED * (len(jobs) - k)
+            self.journal.tell("placing clouds as objects stand", k / len(jobs), left)
             found.append(self.journal.once(f"turned clouds, {k}", make, generator, makers))
         return cat(found)
 

@@ -331,3 +331,11 @@ def test_the_preset_leaves_the_base_free_and_takes_partial_clouds() -> None:
     assert not preset.joint.base_fixed
     assert preset.loss.recon_form == "partial"
     assert Scapo(preset, CATEGORIES["laptop"], generator(0)).variant == "warm"
+
+
+def test_a_start_may_be_a_released_model_by_name() -> None:
+    assert load_run("oven", CATEGORIES["oven"]).category.name == "oven"
+    with pytest.raises(StoreError, match="expected a run of registered on safe, found one of"):
+        load_run("oven", CATEGORIES["safe"])
+    with pytest.raises(StoreError, match="expected a run folder, a checkpoint or a category with"):
+        load_run("ovens", CATEGORIES["oven"])
