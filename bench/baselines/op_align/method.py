@@ -408,13 +408,13 @@ class OpAlign(AbstractMethod):
         config, terms = self.config.loss, {}
         if labels.part is not None:
             error = labelled_segmentation(e.observed.weights, labels.part)
-            terms["labelled_segmentation"] = config.labelled_segmentation * error
+            terms["labelled_segmentation"] = config.labelled_segmentation * error.mean()
         if labels.joints is not None:
             pivot = similarity.forward(labels.joints.pivot) @ turn.mT
             axis = labels.joints.axis @ turn.mT
             joints = e.observed.joints
             error = labelled_joints(e.place(joints.pivot), joints.axis @ e.rotation.mT, pivot, axis)
-            terms["labelled_joints"] = config.labelled_joints * error
+            terms["labelled_joints"] = config.labelled_joints * error.mean()
         return terms
 
     @torch.no_grad()
