@@ -40,7 +40,7 @@ from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.learning import candidates
-from scapo.registered.objects import LEAST_OBJECTS, ObjectViews, grouped
+from scapo.registered.objects import LEAST_OBJECTS, ObjectViews, grouped, rows_by_object
 from scapo.registered.pose_search import BRIEF, CHARGED, successive_halving
 from scapo.registered.pseudo_labels import Candidates
 from scapo.registered.standing import (
@@ -50,7 +50,6 @@ from scapo.registered.standing import (
     exchanged,
     frame_of,
     how_objects_stand,
-    rows_by_object,
 )
 from scapo.registered.template import Placement
 from scapo.registered.views import PartialViews
@@ -156,8 +155,11 @@ class TemplateRegistration(AbstractRegistered):
     ) -> tuple[Candidates, Float[Tensor, " B"]]:
         """The clouds that stand as their objects do, if these are asked (`standing`)."""
         known = [] if labels.instance is None else rows_by_object(labels.instance)
-        alike = self.category.symmetry is not None
-        if self.config.stand == "views" or alike or len(known) < LEAST_OBJECTS:
+        asked, alike = self.config.stand == "objects", self.category.symmetry is not None
+        if not asked or alike or len(known) < LEAST_OBJECTS:
+            if asked:
+                why = "its parts look alike" if alike else "which clouds show the same is not known"
+                logger.warning("how objects stand is not asked: %s", why)
             return super()._trusted(found, cloud, labels, generator)
         if self._frames is None:
             self._frames = self._frames_of(cloud, known, generator)

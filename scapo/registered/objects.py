@@ -187,6 +187,12 @@ def object_candidate(
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 
+def rows_by_object(instance: Int[Tensor, " N"]) -> list[Int[Tensor, " _"]]:
+    """Which clouds show the same object, where there are enough of them (`LEAST_SHOWN`)."""
+    every = [(instance == number).nonzero()[:, 0] for number in instance.unique()]
+    return [rows for rows in every if len(rows) >= LEAST_SHOWN]
+
+
 def grouped(
     instance: Int[Tensor, " N"], config: DiscoveryConfig
 ) -> tuple[list[Int[Tensor, " _"]], list[Int[Tensor, " _"]]]:
@@ -194,8 +200,7 @@ def grouped(
 
     Objects of too few clouds (`LEAST_SHOWN`) are passed over, and all where few objects are left.
     """
-    every = [(instance == number).nonzero()[:, 0] for number in instance.unique()]
-    every = [rows for rows in every if len(rows) >= LEAST_SHOWN]
+    every = rows_by_object(instance)
     if len(every) < LEAST_OBJECTS:
         return [], []
     some = evenly(len(every), config.objects).tolist()

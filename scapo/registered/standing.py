@@ -19,7 +19,7 @@ from torch import Tensor
 
 from scapo.registered.initialisation import registered_together, surest_of
 from scapo.registered.object_frames import Ways, ways_of
-from scapo.registered.objects import AGREEING, LEAST_SHOWN
+from scapo.registered.objects import AGREEING
 from scapo.registered.pairwise import OWN_HIDDEN_COST, within
 from scapo.registered.pose_search import VOTE
 from scapo.registered.pseudo_labels import Candidates
@@ -64,12 +64,6 @@ def frame_of(row: Int[Tensor, " N"], views: PartialViews, rotations: int) -> Obj
     return ObjectFrame(row=row[kept], turn=turn.mT.contiguous(), camera=camera)
 
 
-def rows_by_object(instance: Int[Tensor, " N"]) -> list[Int[Tensor, " V"]]:
-    """Which clouds show the same object, where there are enough of them."""
-    every = [(instance == number).nonzero()[:, 0] for number in instance.unique()]
-    return [rows for rows in every if len(rows) >= LEAST_SHOWN]
-
-
 @torch.no_grad()
 def how_objects_stand(
     found: Candidates, frames: Sequence[ObjectFrame]
@@ -85,13 +79,11 @@ def how_objects_stand(
     ways = [ways_of(one.turn.mT[:, None] @ turn[one.row], vote[one.row]) for one in frames]
     chosen = [0] * len(frames)
     for _ in range(SWEEPS):
-        before, chosen = (
-            chosen,
-            [
-                int((way.share + CAMERAS * likely).argmax())
-                for way, likely in zip(ways, _likely(frames, ways, chosen), strict=True)
-            ],
-        )
+        likely = _likely(frames, ways, chosen)
+        before = chosen
+        chosen = [
+            int((way.share + CAMERAS * its).argmax()) for way, its in zip(ways, likely, strict=True)
+        ]
         if chosen == before:
             break
     return [way.frame[k] for way, k in zip(ways, chosen, strict=True)]

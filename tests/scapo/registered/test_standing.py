@@ -17,6 +17,7 @@ from scapo.records import take
 from scapo.registered import method as room
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
+from scapo.registered.objects import rows_by_object
 from scapo.registered.pseudo_labels import Candidates
 from scapo.registered.standing import (
     AGAINST,
@@ -26,7 +27,6 @@ from scapo.registered.standing import (
     exchanged,
     frame_of,
     how_objects_stand,
-    rows_by_object,
 )
 from scapo.registered.template import Placement
 from scapo.types import Labels
@@ -143,7 +143,12 @@ def test_objects_of_few_clouds_are_passed_over() -> None:
      ("oven", "objects", False, False), ("laptop", "objects", True, False)],
 )  # fmt: skip
 def test_objects_are_asked_where_they_are_known_and_look_one_way(
-    category: str, stand: str, known: bool, asked: bool, monkeypatch: pytest.MonkeyPatch
+    category: str,
+    stand: str,
+    known: bool,
+    asked: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     found, frames, truth, _ = seen_from_above()
     config = replace(RegisteredConfig(), stand=stand, supervision=("instance",))
@@ -166,6 +171,7 @@ def test_objects_are_asked_where_they_are_known_and_look_one_way(
     learned, trust = method._trusted(found, cloud, labels, generator(1))
     if not asked:
         assert learned is found
+        assert ("how objects stand is not asked" in caplog.text) == (stand == "objects")
         assert int(trust.sum()) == round(0.85 * len(trust))
         return
     assert trust.all()
