@@ -15,8 +15,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from scapo.categories import Category
+from scapo.geometry.part_order import joint_order, part_orders
 from scapo.geometry.points import chamfer, gather, k_nearest, robust_chamfer, squared_distances
 from scapo.geometry.rigid import point_line_distance
+from scapo.types import Labels
 
 ReconForm = Literal["squared", "partial", "robust"]
 VarianceForm = Literal["per-point", "whole"]
@@ -228,16 +231,52 @@ def part_mass(weights: Float[Tensor, "B N P"], least: float = 0.05) -> Scalar:
     return F.relu(least - weights.mean((0, 1))).sum()
 
 
-def labelled_segmentation(
-    weights: Float[Tensor, "B N P"], part: Int[Tensor, "B N"]
-) -> Float[Tensor, " B"]:
+def labelled(
+    weights: Float[Tensor, "B N P"],
+    joints: tuple[Float[Tensor, "B J 3"], Float[Tensor, "B J 3"]],
+    labels: Labels,
+    category: Category,
+    scales: tuple[float, float],
+) -> dict[str, Tensor]:
+    """The terms of the labels that there are: cross entropy of the parts, errors of the joints.
+
+    Where a symmetry of the category exchanges parts, the evaluation takes either order, and so does
+    this: of each cloud the one that costs less, in both terms together.
+
+    Args:
+        weights: Of the parts, they sum to 1.
+        joints: Pivots and axes as found.
+        labels: Parts, -1 ignored, and joints in the frame of those found; what is None costs 0.
+        category: Says whether parts exchange.
+        scales: Of the two terms.
+    """
+    orders = part_orders(len(category.parts))[: None if category.symmetry is not None else 1]
+    found: list[dict[str, Tensor]] = []
+    for order, joint in zip(orders, joint_order(orders), strict=True):
+        terms: dict[str, Tensor] = {}
+        if labels.part is not None:
+            slot = torch.tensor(order.argsort()).to(labels.part)
+            part = torch.where(labels.part < 0, -1, slot[labels.part.clamp_min(0)])
+            terms["labelled_segmentation"] = scales[0] * _entropy(weights, part)
+        if labels.joints is not None:
+            pivot, axis = labels.joints.pivot[:, joint], labels.joints.axis[:, joint]
+            terms["labelled_joints"] = scales[1] * _joint_error(*joints, pivot, axis)
+        found.append(terms)
+    every = {name: torch.stack([terms[name] for terms in found]) for name in found[0]}
+    if not every:
+        return {}
+    best = torch.stack(tuple(every.values())).sum(0).argmin(0, keepdim=True)
+    return {name: error.gather(0, best).mean() for name, error in every.items()}
+
+
+def _entropy(weights: Float[Tensor, "B N P"], part: Int[Tensor, "B N"]) -> Float[Tensor, " B"]:
     """Cross entropy of each cloud with true parts, -1 ignored (Table 2, supervised variant)."""
     logs = weights.clamp(min=1e-8).log().mT
     error = F.nll_loss(logs, part, ignore_index=-1, reduction="none")
     return error.sum(-1) / (part != -1).sum(-1).clamp_min(1)
 
 
-def labelled_joints(
+def _joint_error(
     pivot: Float[Tensor, "B J 3"],
     axis: Float[Tensor, "B J 3"],
     true_pivot: Float[Tensor, "B J 3"],

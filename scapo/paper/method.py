@@ -24,7 +24,6 @@ from torch import Tensor
 
 from scapo.categories import Category, JointKind
 from scapo.first_weights import initialise
-from scapo.geometry.part_order import joint_order, part_orders
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.method import AbstractMethod, Mode, ParameterGroup, Stage, Step, changes, evenly
@@ -333,35 +332,15 @@ class Scapo(AbstractMethod):
         similarity: Similarity,
         pose: Float[Tensor, "B 4 4"],
     ) -> dict[str, Tensor]:
-        """The supervised terms of Table 2's variant, in the input frame.
-
-        Where a symmetry exchanges parts, the evaluation takes either order, and so does this: of
-        each cloud the one that fits better, in both terms together.
-        """
-        config, orders = self.config.loss, part_orders(len(self.category.parts))
-        orders = orders[: None if self.category.symmetry is not None else 1]
-        found: list[dict[str, Tensor]] = []
-        for order, joint in zip(orders, joint_order(orders), strict=True):
-            terms: dict[str, Tensor] = {}
-            if labels.part is not None:
-                slot = torch.tensor(order.argsort()).to(labels.part)
-                part = torch.where(labels.part < 0, -1, slot[labels.part.clamp_min(0)])
-                error = losses.labelled_segmentation(explanation.weights, part)
-                terms["labelled_segmentation"] = config.labelled_segmentation * error
-            if labels.joints is not None:
-                encoding, joints = explanation.encoding, explanation.joints
-                pivot = apply(pose, similarity.forward(labels.joints.pivot[:, joint]))
-                axis = labels.joints.axis[:, joint] @ pose[:, :3, :3].mT
-                error = losses.labelled_joints(
-                    encoding.place(joints.pivot), joints.axis @ encoding.rotation.mT, pivot, axis
-                )
-                terms["labelled_joints"] = config.labelled_joints * error
-            found.append(terms)
-        if not found[0]:
-            return {}
-        every = {name: torch.stack([terms[name] for terms in found]) for name in found[0]}
-        best = torch.stack(tuple(every.values())).sum(0).argmin(0, keepdim=True)
-        return {name: error.gather(0, best).mean() for name, error in every.items()}
+        """The supervised terms of Table 2's variant, in the input frame."""
+        config, encoding, found = self.config.loss, explanation.encoding, explanation.joints
+        if labels.joints is not None:
+            pivot = apply(pose, similarity.forward(labels.joints.pivot))
+            axis = labels.joints.axis @ pose[:, :3, :3].mT
+            labels = replace(labels, joints=replace(labels.joints, pivot=pivot, axis=axis))
+        joints = encoding.place(found.pivot), found.axis @ encoding.rotation.mT
+        scales = config.labelled_segmentation, config.labelled_joints
+        return losses.labelled(explanation.weights, joints, labels, self.category, scales)
 
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
         """Canonicalised clouds, reconstructions; in stage 2 the template and the posed template."""

@@ -39,7 +39,7 @@ from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, random_rotations, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, StepDecay, changes
 from scapo.paper.heads import JointPairs, thin
-from scapo.paper.losses import labelled_joints, labelled_segmentation, shape_variance, state_gauge
+from scapo.paper.losses import labelled, shape_variance, state_gauge
 from scapo.paper.skinning import cross_maps, part_maps
 from scapo.pictures import Panel, PictureData
 from scapo.types import Joints, Labels, Observation, Prediction
@@ -405,17 +405,14 @@ class OpAlign(AbstractMethod):
         self, e: Alignment, labels: Labels, similarity: Similarity, turn: Float[Tensor, "B 3 3"]
     ) -> dict[str, Tensor]:
         """The supervised terms of Table 2's variant, on the aligned cloud."""
-        config, terms = self.config.loss, {}
-        if labels.part is not None:
-            error = labelled_segmentation(e.observed.weights, labels.part)
-            terms["labelled_segmentation"] = config.labelled_segmentation * error.mean()
+        config, found = self.config.loss, e.observed.joints
         if labels.joints is not None:
             pivot = similarity.forward(labels.joints.pivot) @ turn.mT
             axis = labels.joints.axis @ turn.mT
-            joints = e.observed.joints
-            error = labelled_joints(e.place(joints.pivot), joints.axis @ e.rotation.mT, pivot, axis)
-            terms["labelled_joints"] = config.labelled_joints * error.mean()
-        return terms
+            labels = replace(labels, joints=replace(labels.joints, pivot=pivot, axis=axis))
+        joints = e.place(found.pivot), found.axis @ e.rotation.mT
+        scales = config.labelled_segmentation, config.labelled_joints
+        return labelled(e.observed.weights, joints, labels, self.category, scales)
 
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:

@@ -232,6 +232,9 @@ def test_labelled_terms_are_zero_on_a_perfect_answer() -> None:
     assert float(terms["labelled_segmentation"]) < 1e-6
     assert float(terms["labelled_joints"]) < 1e-6
     assert labels.part is not None
+    other = made._labelled(sharp, Labels(part=1 - part), similarity, turn)
+    assert float(other["labelled_segmentation"]) < 1e-6  # a laptop's halves, either way
+    made.category = CATEGORIES["oven"]
     wrong = made._labelled(sharp, Labels(part=1 - part), similarity, turn)
     assert float(wrong["labelled_segmentation"]) > 1
 
