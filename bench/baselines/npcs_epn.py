@@ -22,9 +22,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bench.baselines.answers import Target, exchanged, states
 from bench.baselines.npcs_network import Answer, NetworkConfig, NpcsNetwork
 from bench.baselines.similarity_ransac import Similarities, ransac
-from bench.baselines.supervised import Target, exchanged, states
 from scapo.categories import Category
 from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, gather, normalise

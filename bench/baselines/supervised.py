@@ -21,18 +21,25 @@ from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
+from bench.baselines.answers import (
+    Answer,
+    Target,
+    as_seen_by,
+    exchanged,
+    mean_pose,
+    poses_of,
+    states,
+)
 from bench.baselines.body import Block, Body, Features
 from scapo.categories import Category
 from scapo.first_weights import initialise
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import MEAN_RADIUS, gather, normalise
-from scapo.geometry.rigid import apply, invert, mean_rotation, random_rotations, rigid
-from scapo.geometry.rotations import rotmat_to_rotvec
+from scapo.geometry.rigid import apply, invert, random_rotations, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, changes
-from scapo.registered.network import procrustes
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 RADIUS = 0.5
@@ -42,8 +49,6 @@ SMOOTH = 1e-4
 """Squared length under the root of a distance, which so has a gradient everywhere."""
 BEND = 0.05
 """Length up to which the smooth L1 losses are quadratic."""
-ROUNDS, TRUST = 4, 0.05
-"""Repetitions of the Procrustes step, each with votes weighed by 1 / (1 + (off / TRUST)^2)."""
 TINY = 1e-6
 
 
@@ -91,22 +96,6 @@ class LearningConfig:
 
 LEAN = LearningConfig(points=128, dropout=0.0, rotated=0.0, epochs=30, lr=2e-3, batch=32)
 """Of the `cpu` presets: 12 to 15 minutes of one core for 5,000 clouds."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """What the heads say, in the frame and unit of the points."""
-
-    part: Float[Tensor, "B N P"]
-    """Logits."""
-    votes: Float[Tensor, "B N P 3"] | None
-    """Each point in the frame of each part; None when pooled."""
-    pose: Float[Tensor, "B P 4 4"] | None
-    """None as long as there are only votes."""
-    pivot: Float[Tensor, "B J 3"]
-    """In the frame of the base, as the axis."""
-    axis: Float[Tensor, "B J 3"]
-    """Not of unit length."""
 
 
 class Heads(nn.Module):
@@ -169,39 +158,6 @@ def gram_schmidt(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Te
     return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Target:
-    """What the answer should be, in the frame and unit of the points."""
-
-    part: Int[Tensor, "B N"]
-    """-1: not known."""
-    pose: Float[Tensor, "B P 4 4"]
-    pivot: Float[Tensor, "B J 3"]
-    axis: Float[Tensor, "B J 3"]
-    """Unit vectors."""
-
-
-def exchanged(target: Target, symmetry: Float[Tensor, "3 3"]) -> Target:
-    """The same truth with the parts exchanged that the category's symmetry exchanges.
-
-    As the evaluator relabels: of two parts both, of three the last two with their joints;
-    rotations times the symmetry from the right. Where base and child change roles, the joint
-    turns the other way.
-    """
-    turn = rigid(symmetry, symmetry.new_zeros(3))
-    if target.pose.shape[1] == 2:
-        order, joints, sign = torch.tensor([1, 0]), torch.tensor([0]), -1.0
-    else:
-        order, joints, sign = torch.tensor([0, 2, 1]), torch.tensor([1, 0]), 1.0
-    order, joints = order.to(target.part.device), joints.to(target.part.device)
-    return Target(
-        part=torch.where(target.part >= 0, order[target.part], target.part),
-        pose=target.pose[:, order] @ turn,
-        pivot=target.pivot[:, joints],
-        axis=sign * target.axis[:, joints],
-    )
-
-
 def penalties(
     points: Float[Tensor, "B N 3"], answer: Answer, target: Target, config: LearningConfig
 ) -> dict[str, Float[Tensor, " B"]]:
@@ -252,52 +208,6 @@ def best_order(
         name: torch.stack([terms[name] for terms in found]).gather(0, chosen).mean()
         for name in found[0]
     }
-
-
-@torch.no_grad()
-def poses_by_vote(
-    points: Float[Tensor, "B N 3"],
-    votes: Float[Tensor, "B N P 3"],
-    weight: Float[Tensor, "B N P"],
-) -> Float[Tensor, "B P 4 4"]:
-    """The pose of each part that its votes agree on best, those far off counting less."""
-    batch, _, parts, _ = votes.shape
-    source = votes.transpose(1, 2).flatten(0, 1)  # (B P, N, 3)
-    target = points[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
-    given = weight.transpose(1, 2).flatten(0, 1)
-    rotation, shift = procrustes(target, source, given)
-    for _ in range(ROUNDS):
-        off = (source @ rotation.mT + shift[:, None] - target).square().sum(-1)
-        rotation, shift = procrustes(target, source, given / (1 + off / TRUST**2))
-    return rigid(rotation, shift).unflatten(0, (batch, parts))
-
-
-def mean_pose(poses: Float[Tensor, "H *B 4 4"]) -> Float[Tensor, "*B 4 4"]:
-    """Chordal mean of the rotations, mean of the translations."""
-    rotation = mean_rotation(poses[..., :3, :3].movedim(0, -3))
-    return rigid(rotation, poses[..., :3, 3].mean(0))
-
-
-def states(
-    pose: Float[Tensor, "B P 4 4"],
-    axis: Float[Tensor, "B J 3"],
-    category: Category,
-) -> Float[Tensor, "B J"]:
-    """How far each joint is from rest, by the poses of its parts: about or along the axis.
-
-    Args:
-        pose: Of the parts.
-        axis: Unit vectors, in the frame of the base.
-        category: Says which parts a joint links and how.
-    """
-    found = []
-    for j, joint in enumerate(category.joints):
-        motion = invert(pose[:, joint.parent]) @ pose[:, joint.child]
-        step = motion[:, :3, 3]
-        if joint.kind == "revolute":
-            step = rotmat_to_rotvec(motion[:, :3, :3])
-        found.append((step * axis[:, j]).sum(-1))
-    return torch.stack(found, 1)
 
 
 class SupervisedMethod(AbstractMethod, ABC):
@@ -362,6 +272,11 @@ class SupervisedMethod(AbstractMethod, ABC):
         """Nothing to prepare."""
         del stage, observation, labels, generator
 
+    @property
+    def either_order(self) -> bool:
+        """Whether a symmetry exchanges parts of the category, and the network may take either."""
+        return self.learning.either_order and self.category.symmetry is not None
+
     def answer(self, points: Float[Tensor, "B N 3"], generator: torch.Generator | None) -> Answer:
         """Run body and heads."""
         return self.heads(points, self.body(points, generator), generator)
@@ -369,13 +284,22 @@ class SupervisedMethod(AbstractMethod, ABC):
     def answer_all(self, points: Float[Tensor, "B N 3"]) -> Answer:
         """The answer for all points, from clouds as thin as those of the training.
 
-        The cloud is dealt like cards; what each hand says of the whole is averaged.
+        The cloud is dealt like cards; what each hand says of the whole is averaged, once all name
+        the parts as the first does.
         """
         number = points.shape[1]
         hands = -(-number // (self.learning.points or number))
-        dealt = [torch.arange(hand, number, hands) for hand in range(hands)]
-        answers = [self.answer(points[:, some.to(points.device)], None) for some in dealt]
-        back = torch.cat(dealt).argsort().to(points.device)
+        dealt = [torch.arange(hand, number, hands, device=points.device) for hand in range(hands)]
+        answers = [self.answer(points[:, some], None) for some in dealt]
+        answers = [replace(answer, axis=F.normalize(answer.axis, dim=-1)) for answer in answers]
+        if hands > 1 and self.either_order:
+            symmetry = points.new_tensor(self.category.symmetry)
+            first = poses_of(points[:, dealt[0]], answers[0])
+            answers = [
+                as_seen_by(first, points[:, some], answer, symmetry)
+                for some, answer in zip(dealt, answers, strict=True)
+            ]
+        back = torch.cat(dealt).argsort()
         votes = [answer.votes for answer in answers if answer.votes is not None]
         poses = [answer.pose for answer in answers if answer.pose is not None]
         return Answer(
@@ -383,7 +307,7 @@ class SupervisedMethod(AbstractMethod, ABC):
             votes=torch.cat(votes, 1)[:, back] if votes else None,
             pose=mean_pose(torch.stack(poses)) if poses else None,
             pivot=torch.stack([answer.pivot for answer in answers]).mean(0),
-            axis=torch.stack([F.normalize(answer.axis, dim=-1) for answer in answers]).mean(0),
+            axis=torch.stack([answer.axis for answer in answers]).mean(0),
         )
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
@@ -397,7 +321,7 @@ class SupervisedMethod(AbstractMethod, ABC):
             points, target = augmented(points, target, self.learning, step.generator)
         answer = self.answer(points, step.generator if self.training else None)
         targets = [target]
-        if self.learning.either_order and self.category.symmetry is not None:
+        if self.either_order:
             targets.append(exchanged(target, points.new_tensor(self.category.symmetry)))
         return best_order(points, answer, targets, self.learning)
 
@@ -423,10 +347,7 @@ class SupervisedMethod(AbstractMethod, ABC):
         del mode
         points, similarity = normalise(observation.points)
         answer = self.answer_all(GROW * points)
-        weight, pose = answer.part.softmax(-1), answer.pose
-        if answer.votes is not None:
-            pose = poses_by_vote(GROW * points, answer.votes, weight)
-        assert pose is not None  # noqa: S101 - heads answer with votes or poses
+        pose = poses_of(GROW * points, answer)
         axis, base = F.normalize(answer.axis, dim=-1), pose[:, 0]
         pivot = apply(base, answer.pivot)
         state = states(pose, axis, self.category)
@@ -435,7 +356,7 @@ class SupervisedMethod(AbstractMethod, ABC):
         metric = pose.clone()
         metric[..., :3, 3] = similarity.inverse(pose[..., :3, 3] / GROW)
         return Prediction(
-            part_weight=weight,
+            part_weight=answer.part.softmax(-1),
             camera_T_part=metric,
             joints=Joints(
                 pivot=similarity.inverse(pivot / GROW),

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from bench.baselines import gcn3d, pointnet2
-from bench.baselines.supervised import SupervisedMethod, Target
+from bench.baselines.answers import Target
+from bench.baselines.supervised import SupervisedMethod
 from scapo.categories import CATEGORIES
 from scapo.method import Step
 from scapo.types import Labels, Observation

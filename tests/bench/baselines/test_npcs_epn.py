@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
+from bench.baselines.answers import Target, exchanged
 from bench.baselines.npcs_epn import (
     NpcsEpn,
     NpcsEpnConfig,
@@ -19,7 +20,6 @@ from bench.baselines.npcs_epn import (
     median,
     nearby,
 )
-from bench.baselines.supervised import Target, exchanged
 from bench.metrics import sample_errors
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron

@@ -12,19 +12,21 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.testing import assert_close
 
-from bench.baselines.supervised import (
-    GROW,
+from bench.baselines.answers import (
     Answer,
-    LearningConfig,
     Target,
-    augmented,
-    best_order,
     exchanged,
-    gram_schmidt,
     mean_pose,
-    penalties,
     poses_by_vote,
     states,
+)
+from bench.baselines.supervised import (
+    GROW,
+    LearningConfig,
+    augmented,
+    best_order,
+    gram_schmidt,
+    penalties,
 )
 from bench.matching import reorder_poses
 from bench.metrics import sample_errors
@@ -267,3 +269,39 @@ def test_a_perfect_network_predicts_the_truth_in_metres(
     errors.pop("order")
     assert max(value.max() for value in errors.values()) < 1e-2  # degrees and metres
     assert_close(prediction.joints.state, arrays["joint_state"], atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("pooled", [False, True])
+@pytest.mark.parametrize("category", ["laptop", "eyeglasses"])
+def test_all_hands_of_a_cloud_name_the_parts_alike(
+    category: str, pooled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each hand is answered perfectly, but the second in the other order of the parts."""
+    arrays = {name: torch.from_numpy(array).double() for name, array in
+              made.sample_arrays(category, 3, 90, background=0).items()}  # fmt: skip
+    points, method = arrays["points"], lean("gcn3d", category, points=30).eval()
+    truth = Target(
+        part=arrays["part"].long(),
+        pose=arrays["camera_T_part"],
+        pivot=arrays["joint_pivot"],
+        axis=arrays["joint_axis"],
+    )
+    other = exchanged(truth, points.new_tensor(method.category.symmetry))
+    told = iter([truth, other, truth])
+    hand = iter(range(3))
+
+    def answer(some: Tensor, generator: torch.Generator | None) -> Answer:
+        assert generator is None
+        target = next(told)
+        target = replace(target, part=target.part[:, next(hand) :: 3])
+        return perfect(some, target, pooled=pooled)
+
+    monkeypatch.setattr(method, "answer", answer)
+    found, right = method.answer_all(points), perfect(points, truth, pooled=pooled)
+    assert torch.equal(found.part, right.part)
+    assert_close(found.pivot, right.pivot)
+    assert_close(found.axis, right.axis / 3)
+    for one, true in ((found.votes, right.votes), (found.pose, right.pose)):
+        assert (one is None) == (true is None)
+        if one is not None:
+            assert_close(one, true)

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: MIT
+"""What the heads of a supervised network say, what they should, and poses and states read off it.
+
+Where a symmetry of the category exchanges parts, either order is right: `exchanged` is the truth in
+the other one, `as_seen_by` an answer in the order of another.
+
+Lengths are in units of twice the mean radius: the cloud is centred with mean radius 0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from scapo.categories import Category
+from scapo.geometry.rigid import apply, invert, mean_rotation, rigid
+from scapo.geometry.rotations import rotmat_to_rotvec
+from scapo.registered.network import procrustes
+
+ROUNDS, TRUST = 4, 0.05
+"""Repetitions of the Procrustes step, each with votes weighed by 1 / (1 + (off / TRUST)^2)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What the heads say, in the frame and unit of the points."""
+
+    part: Float[Tensor, "B N P"]
+    """Logits."""
+    votes: Float[Tensor, "B N P 3"] | None
+    """Each point in the frame of each part; None when pooled."""
+    pose: Float[Tensor, "B P 4 4"] | None
+    """None as long as there are only votes."""
+    pivot: Float[Tensor, "B J 3"]
+    """In the frame of the base, as the axis."""
+    axis: Float[Tensor, "B J 3"]
+    """Not of unit length."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """What the answer should be, in the frame and unit of the points."""
+
+    part: Int[Tensor, "B N"]
+    """-1: not known."""
+    pose: Float[Tensor, "B P 4 4"]
+    pivot: Float[Tensor, "B J 3"]
+    axis: Float[Tensor, "B J 3"]
+    """Unit vectors."""
+
+
+def exchange(parts: int) -> tuple[list[int], list[int], float]:
+    """Parts and joints in the other order, and the sign of their axes.
+
+    As the evaluator relabels: of two parts both, of three the last two with their joints. Where
+    base and child change roles, the joint turns the other way.
+    """
+    return ([1, 0], [0], -1.0) if parts == 2 else ([0, 2, 1], [1, 0], 1.0)
+
+
+def exchanged(target: Target, symmetry: Float[Tensor, "3 3"]) -> Target:
+    """The same truth with the parts exchanged that the category's symmetry exchanges.
+
+    Rotations times the symmetry from the right.
+    """
+    turn = rigid(symmetry, symmetry.new_zeros(3))
+    order, joints, sign = exchange(target.pose.shape[1])
+    slot = torch.tensor(order).to(target.part)
+    return Target(
+        part=torch.where(target.part >= 0, slot[target.part], target.part),
+        pose=target.pose[:, order] @ turn,
+        pivot=target.pivot[:, joints],
+        axis=sign * target.axis[:, joints],
+    )
+
+
+def as_seen_by(
+    first: Float[Tensor, "B P 4 4"],
+    points: Float[Tensor, "B N 3"],
+    answer: Answer,
+    symmetry: Float[Tensor, "3 3"],
+) -> Answer:
+    """The answer, for each cloud with the parts exchanged where its poses so lie nearer to others.
+
+    A network that may take either order may take another for each hand of a cloud's points.
+
+    Args:
+        first: Poses that the answer's are compared with.
+        points: That the answer is for.
+        answer: With axes of unit length.
+        symmetry: Of the category.
+    """
+    pose = poses_of(points, answer)
+    base = pose[:, 0]
+    order = exchange(pose.shape[1])[0]
+    other = exchanged(
+        Target(
+            part=answer.part.argmax(-1),
+            pose=pose,
+            pivot=apply(base, answer.pivot),
+            axis=answer.axis @ base[:, :3, :3].mT,
+        ),
+        symmetry,
+    )
+    gaps = [(some - first)[..., :3, :3].square().sum((1, 2, 3)) for some in (pose, other.pose)]
+    turned = gaps[1] < gaps[0]
+    back = invert(other.pose[:, 0])
+
+    def either(own: Tensor, theirs: Tensor) -> Tensor:
+        return torch.where(turned.view(-1, *(1,) * (own.ndim - 1)), theirs, own)
+
+    votes, own = answer.votes, answer.pose
+    return Answer(
+        part=either(answer.part, answer.part[..., order]),
+        votes=None if votes is None else either(votes, votes[:, :, order] @ symmetry),
+        pose=None if own is None else either(own, other.pose),
+        pivot=either(answer.pivot, apply(back, other.pivot)),
+        axis=either(answer.axis, other.axis @ back[:, :3, :3].mT),
+    )
+
+
+@torch.no_grad()
+def poses_by_vote(
+    points: Float[Tensor, "B N 3"],
+    votes: Float[Tensor, "B N P 3"],
+    weight: Float[Tensor, "B N P"],
+) -> Float[Tensor, "B P 4 4"]:
+    """The pose of each part that its votes agree on best, those far off counting less."""
+    batch, _, parts, _ = votes.shape
+    source = votes.transpose(1, 2).flatten(0, 1)  # (B P, N, 3)
+    target = points[:, None].expand(-1, parts, -1, -1).flatten(0, 1)
+    given = weight.transpose(1, 2).flatten(0, 1)
+    rotation, shift = procrustes(target, source, given)
+    for _ in range(ROUNDS):
+        off = (source @ rotation.mT + shift[:, None] - target).square().sum(-1)
+        rotation, shift = procrustes(target, source, given / (1 + off / TRUST**2))
+    return rigid(rotation, shift).unflatten(0, (batch, parts))
+
+
+def poses_of(points: Float[Tensor, "B N 3"], answer: Answer) -> Float[Tensor, "B P 4 4"]:
+    """The answer's own, or those that its votes agree on."""
+    if answer.votes is not None:
+        return poses_by_vote(points, answer.votes, answer.part.softmax(-1))
+    assert answer.pose is not None  # noqa: S101 - heads answer with votes or poses
+    return answer.pose
+
+
+def mean_pose(poses: Float[Tensor, "H *B 4 4"]) -> Float[Tensor, "*B 4 4"]:
+    """Chordal mean of the rotations, mean of the translations."""
+    rotation = mean_rotation(poses[..., :3, :3].movedim(0, -3))
+    return rigid(rotation, poses[..., :3, 3].mean(0))
+
+
+def states(
+    pose: Float[Tensor, "B P 4 4"],
+    axis: Float[Tensor, "B J 3"],
+    category: Category,
+) -> Float[Tensor, "B J"]:
+    """How far each joint is from rest, by the poses of its parts: about or along the axis.
+
+    Args:
+        pose: Of the parts.
+        axis: Unit vectors, in the frame of the base.
+        category: Says which parts a joint links and how.
+    """
+    found = []
+    for j, joint in enumerate(category.joints):
+        motion = invert(pose[:, joint.parent]) @ pose[:, joint.child]
+        step = motion[:, :3, 3]
+        if joint.kind == "revolute":
+            step = rotmat_to_rotvec(motion[:, :3, :3])
+        found.append((step * axis[:, j]).sum(-1))
+    return torch.stack(found, 1)
