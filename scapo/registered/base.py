@@ -7,7 +7,7 @@ What `method` and its bound (`labelled`) share: all but where the template comes
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -29,9 +29,11 @@ from scapo.registered.discovery import Discovery
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.learning import (
+    Said,
     SeenClouds,
     candidates,
     dissent,
+    hinged_as,
     taught,
     taught_in_principal_frames,
     undeviated,
@@ -61,7 +63,7 @@ from scapo.registered.pose_search import (
     refine_states,
     successive_halving,
 )
-from scapo.registered.pseudo_labels import Candidates, PseudoLabels, ViewTargets
+from scapo.registered.pseudo_labels import Candidates, LearnedClouds, PseudoLabels, ViewTargets
 from scapo.registered.surfaces import lying
 from scapo.registered.template import (
     ArticulatedTemplate,
@@ -81,17 +83,6 @@ PLACED, KEPT = 50, 250  # Clouds that are placed at a time, and after which what
 PLACING, LATE = 0.08, 0.8
 """Seconds of one core for each of them, and the share of the start that is over before."""
 ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LearnedClouds:
-    """The training clouds whose placements the network learns."""
-
-    index: Int[Tensor, " K"]
-    """Rows of all training clouds."""
-    similarity: Similarity
-    """Their normalisation."""
-    views: PartialViews
 
 
 class AbstractRegistered(AbstractMethod):
@@ -203,6 +194,7 @@ class AbstractRegistered(AbstractMethod):
             self.journal.tell(f"placing clouds, {done} of {total}", share, PLACING * (total - done))
             parts.append(self.journal.once(f"placed clouds from {done} on", make, host, makers))
         self.targets.set(*self._trusted(cat(parts), cloud, labels, host))
+        self._hang(cloud, labels)
         self.network.learned.fill_(1.0)
         self.to(device)
 
@@ -213,12 +205,15 @@ class AbstractRegistered(AbstractMethod):
         del cloud, labels, generator
         return found, found.surest(self.config.trusted)
 
+    def _hang(self, cloud: Float[Tensor, "B N 3"], labels: Labels) -> None:
+        """Add to the targets where hinges of objects sit, if that is known."""
+
     def _candidates_of_all(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
         return cat([self._candidates(some) for some in cloud.split(PLACED)])
 
     def _candidates(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
         seen = self._seen(Observation(points=cloud))
-        left = self._settled(seen, self.config.quick_hypotheses, BRIEF)
+        left = self._settled(seen, self._said(seen), self.config.quick_hypotheses, BRIEF)
         return candidates(self.template, seen, left, self._limits().wider(CHARGED))
 
     def _observed(
@@ -426,35 +421,42 @@ class AbstractRegistered(AbstractMethod):
 
     def _searched(self, seen: SeenClouds, mode: Mode) -> tuple[Placement, Float[Tensor, " B"]]:
         """The best hypothesis after a few steps, and its margin."""
-        left = self._hypotheses(seen, mode == "refine")
+        said = self._said(seen)
+        left = self._hypotheses(seen, said, mode == "refine")
         found = left.best(self._limits().wider(CHARGED))
         final = found.placement
         if self.config.settle and mode == "refine":
             final = refine_states(self.template, seen.views, found, self._limits())
         if self.template.deviates():
             final, _ = refine_deviations(self.template, seen.views, final)
-        return final, found.margin
+        return final if said is None else hinged_as(self.template, said[0], final), found.margin
 
-    def _hypotheses(self, seen: SeenClouds, refine: bool) -> Hypotheses:
+    def _said(self, seen: SeenClouds) -> Said | None:
+        """A placement by the network that knows cameras, and how sure it is; None without one."""
+        if isinstance(self.network, PointVotes) or not self._has_learned():
+            return None
+        placement, _, sure = self._voted(seen)
+        return placement, sure
+
+    def _hypotheses(self, seen: SeenClouds, said: Said | None, refine: bool) -> Hypotheses:
         """Those that are left in the end."""
         config, learned = self.config, self._has_learned()
         if refine:
-            return self._settled(seen, config.grid_hypotheses, THOROUGH)
+            return self._settled(seen, said, config.grid_hypotheses, THOROUGH)
         beside = config.quick_beside if learned else config.quick_hypotheses
-        return self._settled(seen, beside, BRIEF if beside else ALONE)
+        return self._settled(seen, said, beside, BRIEF if beside else ALONE)
 
-    def _settled(self, seen: SeenClouds, beside: int, effort: Effort) -> Hypotheses:
+    def _settled(self, seen: SeenClouds, said: Said | None, beside: int, by: Effort) -> Hypotheses:
         """What is left of the network's and `beside` more, charged where it dissents."""
         views, space = seen.views, self._space()
-        if isinstance(self.network, PointVotes) or not self._has_learned():
+        if said is None:
             start = self._without_network(views, beside)
-            return successive_halving(self.template, views, start, space, effort)
-        said, _, sure = self._voted(seen)
-        start = undeviated(said)
+            return successive_halving(self.template, views, start, space, by)
+        start = undeviated(said[0])
         if beside:
             start = interleave([start, space.propose(views, beside)], len(views.points))
-        left = successive_halving(self.template, views, start, space, effort)
-        charge = dissent(self.template, said, sure, left.placement, self.config.dissent)
+        left = successive_halving(self.template, views, start, space, by)
+        charge = dissent(self.template, *said, left.placement, self.config.dissent)
         return replace(left, unlike=left.unlike + charge)
 
     def _without_network(self, views: PartialViews, count: int) -> Placement:

@@ -154,12 +154,22 @@ class RegisteredConfig(SearchConfig):
     start: str | None = None
     """A run or checkpoint of the same category whose template, and what it learned of views, is
     taken, so that the network alone is trained. None: a template is found."""
+    teach: Literal["all", "hinges"] = "all"
+    """What of the network learns: all, or nothing but where the hinges of objects sit, which models
+    from before do not know (with `start`; a few epochs of one round)."""
     stand: Literal["views", "objects"] = "views"
     """What of the candidates the network learns: the best of each view, or, where it is known which
     clouds show the same object and no symmetry exchanges its parts, those that stand as the object
     does in all of its views."""
     preset: Literal["cpu", "quick"] = "cpu"
     """Where the other defaults come from; quick: a training of two minutes, for trying things."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where hinges alone are to be taught and cannot be."""
+        SearchConfig.__post_init__(self)
+        known = self.start is not None and "instance" in self.supervision
+        if self.teach == "hinges" and not (known and self.camera == "known"):
+            raise ValueError("teach: expected start, supervision instance and a known camera")
 
 
 def cpu_config() -> RegisteredConfig:
@@ -180,5 +190,5 @@ def quick_config() -> RegisteredConfig:
 
 
 PRESETS = {"cpu": cpu_config, "quick": quick_config}
-UNNAMED = ("lr", "supervision", "preset", "start")
+UNNAMED = ("lr", "supervision", "preset", "start", "teach")
 """Fields that a variant is not named after, or not by their values."""

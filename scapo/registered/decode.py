@@ -75,17 +75,21 @@ def part_frames(template: ArticulatedTemplate, placement: Placement) -> PartPose
     Where a joint sits on the body moves its part, not that frame.
     """
     poses = template.part_poses(placement)
-    if not template.deviates():
-        shift = F.pad(placement.shift, (0, 0, 1, 0))
-        back = (poses.rotation @ shift[..., None])[..., 0]
-        return replace(poses, translation=poses.translation - back)
     rested = template.part_poses(_at_rest(template, placement))
     turn = poses.rotation @ rested.rotation.mT
     gap = placement.translation[:, None] - rested.translation
+    aside = F.pad(_aside(template, placement), (0, 0, 1, 0)) @ placement.rotation.mT
     return PartPoses(
         rotation=turn @ placement.rotation[:, None],
-        translation=poses.translation + (turn @ gap[..., None])[..., 0],
+        translation=poses.translation + aside + (turn @ (gap - aside)[..., None])[..., 0],
     )
+
+
+def _aside(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B J 3"]:
+    """Of the object's own hinges from where the template's are, on the base; 0 of what slides."""
+    if placement.pivot is None:
+        return torch.zeros_like(placement.shift)
+    return (placement.pivot - template.pivots(placement)) * (1 - slides(template))
 
 
 def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
@@ -99,10 +103,15 @@ def canonical_surface(
 ) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]]:
     """Points and normals of the template in each cloud's size, at the state that counts as 0.
 
-    They are in the template's frame.
+    They are in the template's frame. Moved by its joint, each part lies as it is placed.
     """
+    still = _at_rest(template, placement)
+    own, aside = placement.rotation[:, None], _aside(template, placement)
+    rested, turned = (template.part_poses(some).rotation[:, 1:] for some in (still, placement))
+    returned = (own.mT @ rested @ turned.mT @ own @ aside[..., None])[..., 0]
     still = replace(
-        _at_rest(template, placement),
+        still,
+        shift=still.shift + aside - returned,
         rotation=torch.eye(3).to(placement.rotation).expand_as(placement.rotation),
         translation=torch.zeros_like(placement.translation),
     )

@@ -28,12 +28,13 @@ from scapo.geometry.points import Similarity, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.method import changes
 from scapo.records import take
-from scapo.registered.base import AbstractRegistered, LearnedClouds
+from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import UNNAMED, SearchConfig
 from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
 from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.pose_search import SearchResult
+from scapo.registered.pseudo_labels import LearnedClouds
 from scapo.registered.template import (
     SPAN,
     ArticulatedTemplate,

@@ -8,7 +8,7 @@ about their ray and thinned (`taught`), and is asked for a placement (`voted`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from scapo.geometry.points import Similarity, farthest_points, gather, k_nearest, nearest, normalise
 from scapo.geometry.rigid import rotation_angle
-from scapo.records import take
+from scapo.records import cat, take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.decode import nearest_weights
 from scapo.registered.joint_limits import JointLimits
@@ -31,8 +31,10 @@ from scapo.registered.template import (
     turn_placement,
 )
 from scapo.registered.view_network import (
+    SMOOTH,
     ViewNetwork,
     ViewTarget,
+    ViewVotes,
     along_rays,
     placed_by_votes,
     view_losses,
@@ -45,6 +47,10 @@ THINNED = 0.2  # Share of a cloud's points that the network may not be shown in 
 OTHER_WAY = 0.4  # Rad: from about there on a part is turned another way than the network says
 UNIT = 127  # Of stored normals
 PRICE = 5.0  # Of a unit of loss by which the search prefers another candidate, in the network's
+
+
+Said = tuple[Placement, Float[Tensor, " B"]]
+"""What a network says: placements, and how sure it is of each."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,10 +100,9 @@ def candidates(
     if template.deviates():  # told of the best alone: it takes longer than all that was before
         row = rows.gather(1, cost.argmin(1, keepdim=True))[:, 0]
         fine, _ = refine_deviations(template, seen.views, take(placement, row))
-        told = {f.name: getattr(placement, f.name).clone() for f in fields(Placement)}
-        for name, values in told.items():
-            values[row] = getattr(fine, name)
-        placement = Placement(**told)
+        index = rows.flatten().clone()
+        index[row] = cost.numel() + torch.arange(len(row), device=row.device)
+        placement = take(cat([placement, fine]), index)
     source, label = oriented(seen.points, seen.normals), template.logit.argmax(-1).to(torch.uint8)
     part = []
     for row in rows.unbind(1):
@@ -145,6 +150,10 @@ def taught(
     placement = turn_placement(placement, turn.repeat_interleave(part.shape[1], 0))
     with torch.no_grad():
         poses = template.part_poses(placement)
+    noise = torch.randn(points.shape, generator=generator, device=points.device)
+    points = points @ turn.mT + NOISE * noise
+    normals = targets.normals[row].to(points) / UNIT @ turn.mT
+    votes = network(points[:, shown], normals[:, shown], len(asked))
     target = ViewTarget(
         poses=poses,
         part=part[..., asked],
@@ -153,12 +162,19 @@ def taught(
         deviation=targets.deviation[row],
         price=PRICE * targets.gap[row],
         trust=targets.trust[row],
+        aside=_aside(votes, template, targets, row) if len(targets.hinge) else None,
     )
-    noise = torch.randn(points.shape, generator=generator, device=points.device)
-    points = points @ turn.mT + NOISE * noise
-    normals = targets.normals[row].to(points) / UNIT @ turn.mT
-    votes = network(points[:, shown], normals[:, shown], len(asked))
     return view_losses(votes, points[:, asked], target)
+
+
+def _aside(
+    votes: ViewVotes, template: ArticulatedTemplate, targets: ViewTargets, row: Int[Tensor, " B"]
+) -> Float[Tensor, "B C J"]:
+    """How far hinges are from where the votes say, across their axes, by the trust in them."""
+    axis = template.directions().detach()
+    off = votes.pivot(template)[:, None] - targets.hinge[row]
+    off = off - (off * axis).sum(-1, keepdim=True) * axis
+    return targets.hung[row][:, None] * (off.square().sum(-1) + SMOOTH).sqrt()
 
 
 def taught_in_principal_frames(
@@ -210,12 +226,29 @@ def voted(
     points = seen.clean @ turn.mT
     votes = network(points, seen.normals @ turn.mT, points.shape[1])
     placement, sure = placed_by_votes(votes, points, template)
+    if bool(network.hinged):
+        placement = replace(placement, pivot=votes.pivot(template))
     return turn_placement(placement, turn.mT), votes.part.softmax(-1), sure
 
 
 def undeviated(placement: Placement) -> Placement:
-    """About the category's axes, as a search begins."""
-    return replace(placement, deviation=torch.zeros_like(placement.deviation))
+    """About the category's axes and hinges, as a search begins."""
+    return replace(placement, deviation=torch.zeros_like(placement.deviation), pivot=None)
+
+
+def hinged_as(template: ArticulatedTemplate, said: Placement, found: Placement) -> Placement:
+    """What a search found, with hinges where the network says, if both mean the same frame.
+
+    Args:
+        template: Whose placements they are.
+        said: The network's of B views.
+        found: Of the same views.
+    """
+    if said.pivot is None:
+        return found
+    apart = rotation_angle(said.rotation, found.rotation)[:, None, None]
+    pivot = torch.where(apart < OTHER_WAY, said.pivot, template.pivots(found))
+    return replace(found, pivot=pivot)
 
 
 def dissent(

@@ -22,6 +22,7 @@ tell, and where it believes the camera is there `quick` and `refine` take it to 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -31,18 +32,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import Category
-from scapo.geometry.points import Similarity
-from scapo.method import changes
+from scapo.geometry.points import Similarity, normalise
+from scapo.method import ParameterGroup, Stage, Step, changes
 from scapo.records import cat
-from scapo.registered.base import FIRST, LATE, PLACING, AbstractRegistered, LearnedClouds
+from scapo.registered.base import FIRST, LATE, PLACING, AbstractRegistered
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig
 from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.learning import candidates
 from scapo.registered.objects import LEAST_OBJECTS, ObjectViews, grouped, rows_by_object
+from scapo.registered.outliers import replaced
 from scapo.registered.pose_search import BRIEF, CHARGED, successive_halving
-from scapo.registered.pseudo_labels import Candidates
+from scapo.registered.pseudo_labels import Candidates, LearnedClouds
 from scapo.registered.standing import (
     ObjectFrame,
     against,
@@ -52,6 +54,7 @@ from scapo.registered.standing import (
     how_objects_stand,
 )
 from scapo.registered.template import Placement
+from scapo.registered.view_network import ViewNetwork
 from scapo.registered.views import PartialViews
 from scapo.released import find
 from scapo.store.checkpoint import (
@@ -111,9 +114,36 @@ class TemplateRegistration(AbstractRegistered):
         for name in ("template", "pseudo", "orientation"):
             getattr(self, name).load_state_dict(getattr(known, name).state_dict())
         sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
+        if self.config.teach == "hinges" and (sizes[0] != sizes[1] or not known._has_learned()):
+            raise ValueError(
+                f"start: expected a run whose network is one as here, found {self.config.start}; "
+                "without it there is more to teach than hinges"
+            )
         if sizes[0] == sizes[1]:
             self.network.load_state_dict(known.network.state_dict())
         self._place(observation.points, labels, generator, LATE)
+
+    def stages(self) -> tuple[Stage, ...]:
+        """The network's rounds, of all of it or of what it says of hinges."""
+        made = super().stages()
+        if self.config.teach == "all":
+            return made
+        hinges = (ParameterGroup(module="network.hinge"),)
+        return tuple(replace(stage, parameters=hinges) for stage in made)
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        """As `AbstractRegistered`; what is not taught does not take on means of batches either."""
+        if self.config.teach == "hinges":
+            self.network.eval()
+        return super().losses(observation, labels, step)
+
+    def _hang(self, cloud: Float[Tensor, "B N 3"], labels: Labels) -> None:
+        """By the views of each object (`hinges`), where the network knows cameras."""
+        if labels.instance is None or not isinstance(self.network, ViewNetwork):
+            return
+        size = normalise(replaced(cloud, self.targets.inlier))[1].scale
+        self.targets.hang(self.template, size, rows_by_object(labels.instance))
+        self.network.hinged.fill_(1.0)
 
     @property
     def variant(self) -> str:

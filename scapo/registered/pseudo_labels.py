@@ -3,15 +3,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int8, UInt8
+from jaxtyping import Bool, Float, Int, Int8, UInt8
 from torch import Tensor, nn
 
-from scapo.registered.template import Placement
+from scapo.geometry.points import Similarity
+from scapo.records import take
+from scapo.registered.hinges import as_placed_by, hinges_of_objects
+from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_bank import ShownPoints
+from scapo.registered.views import PartialViews
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedClouds:
+    """The training clouds whose placements the network learns."""
+
+    index: Int[Tensor, " K"]
+    """Rows of all training clouds."""
+    similarity: Similarity
+    """Their normalisation."""
+    views: PartialViews
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,8 +137,11 @@ class PseudoLabels(_Tensors):
 class ViewTargets(_Tensors):
     """Candidates as a part of the method's state, which training alone needs."""
 
-    PLACEMENT: ClassVar = tuple(item.name for item in fields(Placement))
-    NAMES: ClassVar[tuple[str, ...]] = (*PLACEMENT, "part", "gap", "trust", "inlier", "normals")
+    PLACEMENT: ClassVar = (*PseudoLabels.PLACEMENT, "deviation")
+    HINGES: ClassVar = ("hinge", "hung")
+    NAMES: ClassVar[tuple[str, ...]] = (
+        *(*PLACEMENT, "part", "gap", "trust", "inlier", "normals"), *HINGES,
+    )  # fmt: skip
     LATER: ClassVar[tuple[str, ...]] = NAMES
     log_scale: Tensor
     shift: Tensor
@@ -133,15 +152,35 @@ class ViewTargets(_Tensors):
     """Weight of each cloud when the network learns."""
     inlier: Tensor
     normals: Tensor
+    hinge: Tensor
+    """(B, C, J, 3) hinges of the object that each shows, on the base as each candidate places it;
+    empty where they are not known."""
+    hung: Tensor
+    """(B, J) trust in each."""
 
     def set(self, found: Candidates, trust: Float[Tensor, " B"]) -> None:
-        """Replace all."""
+        """Replace all; hinges are not known."""
+        self.clear()
         count = found.gap.shape[1]
         for name in self.PLACEMENT:
             setattr(self, name, getattr(found.placement, name).unflatten(0, (-1, count)))
         self.part, self.gap, self.inlier = found.part, found.gap, found.inlier
         self.normals = found.normals
         self.trust = trust
+
+    def hang(
+        self,
+        template: ArticulatedTemplate,
+        size: Float[Tensor, " B"],
+        objects: Sequence[Int[Tensor, " V"]],
+    ) -> None:
+        """Add the hinges of the objects (`hinges_of_objects`), by the best candidate of each."""
+        count, best = self.gap.shape[1], self.gap.argmin(1)
+        every = self.placement(torch.arange(len(best)))
+        row = torch.arange(len(best)) * count + best
+        hinges = hinges_of_objects(template, take(every, row), size, objects)
+        self.hinge = as_placed_by(every, best, hinges, template)
+        self.hung = hinges.trust
 
     def placement(self, row: Tensor) -> Placement:
         """All candidates of some clouds, those of a cloud in a row."""

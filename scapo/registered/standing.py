@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from scapo.records import cat, take
 from scapo.registered.initialisation import registered_together, surest_of
 from scapo.registered.object_frames import Ways, ways_of
 from scapo.registered.objects import AGREEING
@@ -139,15 +140,13 @@ def against(
 
 def exchanged(found: Candidates, row: Int[Tensor, " K"], other: Candidates) -> Candidates:
     """Candidates, those of some clouds in place of what they were."""
-    shape = found.gap.shape
-    values = {}
-    for field in fields(found.placement):
-        every = getattr(found.placement, field.name).clone().unflatten(0, shape)
-        every[row] = getattr(other.placement, field.name).unflatten(0, other.gap.shape)
-        values[field.name] = every.flatten(0, 1)
+    count, total = found.gap.shape[1], len(found.gap)
+    every = torch.arange(total * count).view(total, count)
+    every[row] = total * count + torch.arange(len(row) * count).view(-1, count)
+    placement = take(cat([found.placement, other.placement]), every.flatten())
     rest = {
         field.name: getattr(found, field.name).index_copy(0, row, getattr(other, field.name))
         for field in fields(found)
         if field.name != "placement"
     }
-    return Candidates(placement=type(found.placement)(**values), **rest)
+    return Candidates(placement=placement, **rest)

@@ -15,7 +15,7 @@ Lengths are in normalised units.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from scapo.geometry.points import Similarity, fibonacci_sphere, gather, nearest
 from scapo.geometry.rotations import rotvec_to_rotmat
-from scapo.records import cat, take
+from scapo.records import cat, map_tensors, take
 from scapo.registered.pairwise import within
 from scapo.registered.synchronisation import densest
 from scapo.registered.template import ArticulatedTemplate, Placement, across_axis, slides
@@ -153,4 +153,4 @@ def _fitted(
         cost(placed()).sum().backward()
         optimizer.step()
     end = placed()
-    return Placement(**{one.name: getattr(end, one.name).detach() for one in fields(end)})
+    return map_tensors(end, Tensor.detach)

@@ -47,6 +47,9 @@ class Placement:
     """Of a joint and its part on the base, across its axis; template frame, after scaling."""
     deviation: Float[Tensor, "B J 3"]
     """Of a hinge's axis from the category's (rotation vector, template frame)."""
+    pivot: Float[Tensor, "B J 3"] | None = None
+    """Where the object's own joints sit on the base, template frame, after scaling. What is placed
+    does not depend on it; None: where the template's are."""
 
     @staticmethod
     def at(
@@ -218,15 +221,21 @@ class ArticulatedTemplate(nn.Module):
         filled = [points if len(points) else self.points for points in own]
         return torch.stack([points.quantile(ends, 0).mean(0) for points in filled])
 
-    def joints_in_view(
-        self, placement: Placement
-    ) -> tuple[Float[Tensor, "B J 3"], Float[Tensor, "B J 3"]]:
-        """Pivots and axes in the frame of every view.
+    def pivots(self, placement: Placement) -> Float[Tensor, "B J 3"]:
+        """Of the template's joints on the base of every view, template frame, after scaling.
 
         A sliding joint has no pivot of its own: the middle of its part stands for it.
         """
         pivot = torch.where(slides(self) > 0, self.part_centres()[1:], self.pivot)
-        pivot = pivot * placement.log_scale.exp()[:, None] + placement.shift
+        return pivot * placement.log_scale.exp()[:, None] + placement.shift
+
+    def joints_in_view(
+        self, placement: Placement
+    ) -> tuple[Float[Tensor, "B J 3"], Float[Tensor, "B J 3"]]:
+        """Pivots and axes in the frame of every view, the object's own where they are known."""
+        pivot = self.pivots(placement)
+        if placement.pivot is not None:
+            pivot = torch.where(slides(self) > 0, pivot, placement.pivot)
         pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
         return pivot, self.own_directions(placement) @ placement.rotation.mT
 

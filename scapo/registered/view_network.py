@@ -42,7 +42,7 @@ ROUNDS, TRUST = 4, 0.025
 OTHERS = 0.02  # Weight in a part's pose of points that are not its own
 GOOD = 0.06  # Normalised length by which the confidence falls that votes are consistent
 SMOOTH = 1e-6  # Squared normalised length within which the distance of votes is smooth
-WEIGHTS = {"votes": 10.0, "part": 0.5, "size": 1.0}
+WEIGHTS = {"votes": 10.0, "part": 0.5, "size": 1.0, "hinge": 1.0}
 """Of the terms of the loss: the votes make the pose, the others should not outweigh them."""
 BESIDE = 0.06  # Rad: standard deviation of what a view is turned from the ray while learning
 TINY = 1e-6
@@ -59,6 +59,12 @@ class ViewVotes:
     log_scale: Float[Tensor, "B 3"]
     shift: Float[Tensor, "B J 3"]
     deviation: Float[Tensor, "B J 3"]
+    hinge: Float[Tensor, "B J 3"]
+    """Of the object's own hinges from the template's, scaled; template frame."""
+
+    def pivot(self, template: ArticulatedTemplate) -> Float[Tensor, "B J 3"]:
+        """Where the object's own hinges sit on the base."""
+        return template.pivot.detach() * self.log_scale.detach().exp()[:, None] + self.hinge
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +81,9 @@ class ViewTarget:
     """What a candidate costs beside its loss."""
     trust: Float[Tensor, " B"]
     """Weight of each view, in [0, 1]."""
+    aside: Float[Tensor, "B C J"] | None = None
+    """How far the hinges that the votes say are from the object's own, weighed by what is known of
+    these; None where nothing is."""
 
 
 def image_of(
@@ -121,6 +130,8 @@ class ViewNetwork(nn.Module):
 
     learned: Tensor
     """1 once it was taught; before, nothing that it says is asked for."""
+    hinged: Tensor
+    """1 once it was taught where hinges of objects sit."""
 
     def __init__(self, parts: int, joints: int, *, channels: int) -> None:
         super().__init__()
@@ -143,7 +154,9 @@ class ViewNetwork(nn.Module):
         self.point = nn.Linear(hidden, hidden)
         self.vote = nn.Linear(hidden, 4 * parts)
         self.rest = nn.Linear(last, 3 + 6 * joints)
+        self.hinge = nn.Linear(last, 3 * joints)
         self.register_buffer("learned", torch.zeros(()))
+        self.register_buffer("hinged", torch.zeros(()))
 
     def forward(
         self, points: Float[Tensor, "B N 3"], normals: Float[Tensor, "B N 3"], count: int
@@ -176,6 +189,8 @@ class ViewNetwork(nn.Module):
             log_scale=rest[:, :3],
             shift=rest[:, 3 : 3 + 3 * j].unflatten(1, (j, 3)),
             deviation=rest[:, 3 + 3 * j :].unflatten(1, (j, 3)),
+            # What else it learns does not change for what it says of hinges.
+            hinge=self.hinge(code.detach()).unflatten(1, (j, 3)),
         )
 
     def _load_from_state_dict(
@@ -185,12 +200,18 @@ class ViewNetwork(nn.Module):
         *rest: Any,  # noqa: ANN401 - as torch calls it
         **named: Any,  # noqa: ANN401
     ) -> None:
-        """Checkpoints from before hold another network, which is left: this one is not taught."""
+        """Checkpoints from before hold another network, which is left: this one is not taught.
+
+        Some hold this one, not yet taught where hinges sit.
+        """
+        own = self.state_dict()
+        lacking = [name for name in own if name.startswith("hinge")]
         if prefix + "learned" not in state_dict:
+            lacking = list(own)
             for name in [name for name in state_dict if name.startswith(prefix)]:
                 del state_dict[name]
-            own = self.state_dict()
-            state_dict.update({prefix + name: value for name, value in own.items()})
+        for name in lacking:
+            state_dict.setdefault(prefix + name, own[name])
         super()._load_from_state_dict(state_dict, prefix, *rest, **named)
 
 
@@ -297,6 +318,8 @@ def view_losses(
     terms = {name: WEIGHTS[name] * value for name, value in terms.items()}
     cost = torch.stack(list(terms.values())).sum(0) + target.price
     best = cost.argmin(1, keepdim=True)
+    if target.aside is not None:
+        terms["hinge"] = WEIGHTS["hinge"] * target.aside.mean(-1)
     trust = target.trust / target.trust.sum().clamp_min(TINY)
     return {name: (trust * value.gather(1, best)[:, 0]).sum() for name, value in terms.items()}
 

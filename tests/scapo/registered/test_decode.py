@@ -26,8 +26,9 @@ from tests.helpers.strategies import generator
 
 
 @pytest.mark.parametrize("deviation", [0.0, 0.2])
+@pytest.mark.parametrize("own_hinges", [False, True])
 @torch.no_grad()
-def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
+def test_parts_and_joint_of_a_prediction_belong_together(deviation: float, own_hinges: bool):
     cloud = torch.randn(3, 50, 3, generator=generator(0)) + torch.tensor([0, 0, 4.0])
     _, similarity = normalise(cloud)
     rotation = random_rotations(3, generator(1))
@@ -44,6 +45,9 @@ def test_parts_and_joint_of_a_prediction_belong_together(deviation: float):
     if deviation:
         shape.rest.fill_(-0.3)
         shape.load.fill_(0.1)
+    if own_hinges:
+        elsewhere = torch.tensor([0.07, -0.02, 0.05])
+        placement = replace(placement, pivot=shape.pivots(placement) + elsewhere)
     weight = torch.full((3, 50, 2), 0.5)
     found = placed_prediction(shape, placement, weight, similarity, torch.ones(3))
     assert found.camera_T_part is not None

@@ -203,3 +203,30 @@ def test_a_run_begins_at_another_ones_template_and_refuses_what_does_not_fit(
     larger = replace(begun, discovery=replace(DISCOVERY, final_points=300))
     with pytest.raises(ValueError, match=r"found one of 240 .* add --discovery\.final-points 240"):
         method(larger).start("votes", clouds(10), Labels(), g)
+
+
+def test_hinges_alone_are_taught_to_a_network_that_is_there(
+    first: TrainingData, tmp_path: Path
+) -> None:
+    begun = replace(TOLD, start=str(tmp_path / "first"), teach="hinges", rounds=1)
+    told = replace(first, labels=Labels(instance=torch.zeros(10, dtype=torch.long)))
+    fit.fit(method(begun), told, tmp_path / "second", RUN)
+    before, after = (load(tmp_path / name).model for name in ("first", "second"))
+    weights, taught = before.state_dict(), after.state_dict()
+    changed = {
+        name
+        for name, value in taught.items()
+        if name.startswith("network") and not torch.equal(value, weights[name])
+    }
+    assert changed == {"network.hinge.weight", "network.hinge.bias", "network.hinged"}
+    found = [model.predict(first.observation, "quick") for model in (before, after)]
+    assert all(one.joints is not None for one in found)
+    assert torch.equal(found[0].part_weight, found[1].part_weight)
+    pivots = [one.joints.pivot for one in found if one.joints is not None]
+    assert (pivots[0] - pivots[1]).abs().max() > 1e-4
+    with pytest.raises(ValueError, match="expected a run whose network is one as here"):
+        method(replace(begun, channels=2)).start(
+            "votes", clouds(10), told.labels, torch.Generator()
+        )
+    with pytest.raises(ValueError, match="teach: expected start, supervision instance"):
+        replace(TOLD, teach="hinges")

@@ -47,6 +47,7 @@ def perfect(shape: ArticulatedTemplate, points: Tensor, placement: Placement) ->
         log_scale=placement.log_scale,
         shift=placement.shift,
         deviation=placement.deviation,
+        hinge=placement.shift,
     )
 
 
@@ -159,7 +160,9 @@ def test_the_candidate_that_costs_least_is_learned() -> None:
         assert terms["size"] == 0
         if not small:
             assert_close(terms["votes"], alone["votes"])
-    assert set(terms) == set(WEIGHTS)
+    assert set(terms) == set(WEIGHTS) - {"hinge"}
+    known = replace(target, aside=torch.full((1, 2, 1), 0.3))
+    assert_close(view_losses(votes, views.points, known)["hinge"], torch.tensor(0.3))
 
 
 @torch.no_grad()
@@ -227,5 +230,6 @@ def test_weights_of_another_network_are_left_and_it_counts_as_not_taught() -> No
     again.learned.fill_(0.0)
     again.load_state_dict({"edge.0.weight": torch.zeros(3, 3)})
     assert again.learned == 0
+    assert again.hinged == 0
     assert all(torch.equal(before[name], value) for name, value in again.state_dict().items()
                if name != "learned")  # fmt: skip
