@@ -147,6 +147,7 @@ def test_the_base_is_mirrored_and_the_part_is_not() -> None:
     assert torch.equal(whole.pivot, cut.pivot)
 
 
+@pytest.mark.slow
 def test_the_mirror_image_that_completes_the_base_is_kept(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

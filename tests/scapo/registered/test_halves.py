@@ -87,6 +87,7 @@ def mistaken() -> ArticulatedTemplate:
     return made
 
 
+@pytest.mark.slow
 def test_the_halves_of_scissors_are_found_where_the_tip_of_one_was_the_part(
     monkeypatch: pytest.MonkeyPatch,
 ):

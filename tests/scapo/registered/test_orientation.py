@@ -189,6 +189,7 @@ def taught(
     return taught_by_objects(known, ("revolute",), owned, hypotheses, generator(8))
 
 
+@pytest.mark.slow
 def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loss takes a wrong turn of two objects in five, the same; the consensus knows half."""
     turns = random_rotations(COUNT, generator(7))

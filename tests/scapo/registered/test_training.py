@@ -169,6 +169,7 @@ def first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrainingData:
     return data
 
 
+@pytest.mark.slow
 def test_clouds_are_placed_by_several_processes_as_by_one(
     first: TrainingData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

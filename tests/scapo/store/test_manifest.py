@@ -280,7 +280,7 @@ def test_a_shard_that_would_fill_the_memory_is_refused(folder: Path) -> None:
 
 def test_a_manifest_of_very_many_objects_is_read_at_once(folder: Path, written: str) -> None:
     first = json.loads(written)["instances"][0]
-    edit_manifest(folder, instances=[{**first, "id": str(k)} for k in range(3_000)])
+    edit_manifest(folder, instances=[{**first, "id": str(k)} for k in range(1_000)])
     begun = time.process_time()
-    assert len(read_manifest(folder / "manifest.json").instances) == 3_000
-    assert time.process_time() - begun < 10
+    assert len(read_manifest(folder / "manifest.json").instances) == 1_000
+    assert time.process_time() - begun < 5

@@ -30,7 +30,7 @@ REAL = {
 
 @cache
 def known(category: str) -> tuple[ArticulatedObject, ...]:
-    return tuple(generate(category, "train", 2, index) for index in range(100))
+    return tuple(generate(category, "train", 2, index) for index in range(70))
 
 
 @cache
