@@ -138,12 +138,18 @@ class TemplateRegistration(AbstractRegistered):
         return super().losses(observation, labels, step)
 
     def _hang(self, cloud: Float[Tensor, "B N 3"], labels: Labels) -> None:
-        """By the views of each object (`hinges`), where the network knows cameras."""
+        """By the views of each object (`hinges`), where the network knows cameras.
+
+        Raises:
+            ValueError: Hinges alone are to be taught, and of no object they are told.
+        """
         if labels.instance is None or not isinstance(self.network, ViewNetwork):
             return
         size = normalise(replaced(cloud, self.targets.inlier))[1].scale
-        self.targets.hang(self.template, size, rows_by_object(labels.instance))
-        self.network.hinged.fill_(1.0)
+        if self.targets.hang(self.template, size, rows_by_object(labels.instance)):
+            self.network.hinged.fill_(1.0)
+        elif self.config.teach == "hinges":
+            raise ValueError("teach: expected objects with a hinge and several views, found none")
 
     @property
     def variant(self) -> str:

@@ -173,14 +173,20 @@ class ViewTargets(_Tensors):
         template: ArticulatedTemplate,
         size: Float[Tensor, " B"],
         objects: Sequence[Int[Tensor, " V"]],
-    ) -> None:
-        """Add the hinges of the objects (`hinges_of_objects`), by the best candidate of each."""
+    ) -> bool:
+        """Add the hinges of the objects (`hinges_of_objects`), by the best candidate of each.
+
+        Returns: Whether there are any.
+        """
         count, best = self.gap.shape[1], self.gap.argmin(1)
         every = self.placement(torch.arange(len(best)))
         row = torch.arange(len(best)) * count + best
         hinges = hinges_of_objects(template, take(every, row), size, objects)
+        if not bool(hinges.trust.any()):
+            return False
         self.hinge = as_placed_by(every, best, hinges, template)
         self.hung = hinges.trust
+        return True
 
     def placement(self, row: Tensor) -> Placement:
         """All candidates of some clouds, those of a cloud in a row."""

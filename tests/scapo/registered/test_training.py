@@ -225,6 +225,9 @@ def test_hinges_alone_are_taught_to_a_network_that_is_there(
     assert torch.equal(found[0].part_weight, found[1].part_weight)
     pivots = [one.joints.pivot for one in found if one.joints is not None]
     assert (pivots[0] - pivots[1]).abs().max() > 1e-4
+    alone = replace(told, labels=Labels(instance=torch.arange(10)))
+    with pytest.raises(ValueError, match="objects with a hinge and several views, found none"):
+        fit.fit(method(begun), alone, tmp_path / "third", RUN)
     with pytest.raises(ValueError, match="expected a run whose network is one as here"):
         method(replace(begun, channels=2)).start(
             "votes", clouds(10), told.labels, torch.Generator()
