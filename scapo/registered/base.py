@@ -39,18 +39,14 @@ from scapo.registered.learning import (
     undeviated,
     voted,
 )
-from scapo.registered.network import (
-    PointVotes,
-    in_principal_frames,
-    own_frame,
-    surest,
-)
+from scapo.registered.network import PointVotes, in_principal_frames, own_frame, surest
 from scapo.registered.orientation import VIEWS_CHARGE, OrientationScorer
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
     ALONE,
     BRIEF,
     CHARGED,
+    OWN,
     THOROUGH,
     Effort,
     Hypotheses,
@@ -205,7 +201,7 @@ class AbstractRegistered(AbstractMethod):
         del cloud, labels, generator
         return found, found.surest(self.config.trusted)
 
-    def _hang(self, cloud: Float[Tensor, "B N 3"], labels: Labels) -> None:
+    def _hang(self, cloud: Tensor, labels: Labels) -> None:
         """Add to the targets where hinges of objects sit, if that is known."""
 
     def _candidates_of_all(self, cloud: Float[Tensor, "B N 3"]) -> Candidates:
@@ -392,7 +388,7 @@ class AbstractRegistered(AbstractMethod):
             kept = seen.views.points
             placement, votes, sure = surest(self.network, kept)
             return placement, gather(votes.part.softmax(-1), nearest(seen.points, kept)), sure
-        return voted(self.network, self.template, seen)
+        return voted(self.network, self.template, seen, self.config.looks)
 
     def _answer(
         self,
@@ -425,7 +421,7 @@ class AbstractRegistered(AbstractMethod):
         left = self._hypotheses(seen, said, mode == "refine")
         found = left.best(self._limits().wider(CHARGED))
         final = found.placement
-        if self.config.settle and mode == "refine":
+        if self.config.settle and mode == "refine" and said is None:
             final = refine_states(self.template, seen.views, found, self._limits())
         if self.template.deviates():
             final, _ = refine_deviations(self.template, seen.views, final)
@@ -442,7 +438,8 @@ class AbstractRegistered(AbstractMethod):
         """Those that are left in the end."""
         config, learned = self.config, self._has_learned()
         if refine:
-            return self._settled(seen, said, config.grid_hypotheses, THOROUGH)
+            found = self._settled(seen, said, config.grid_hypotheses, THOROUGH)
+            return found if said is None else found.with_others(self._settled(seen, said, 0, OWN))
         beside = config.quick_beside if learned else config.quick_hypotheses
         return self._settled(seen, said, beside, BRIEF if beside else ALONE)
 

@@ -111,6 +111,8 @@ class SearchConfig:
     """Learning rate of the network at the beginning; it falls to a hundredth on half a cosine."""
     batch: int = 32
     """Clouds of one step of the network's optimiser."""
+    looks: int = 4
+    """Rolls about its ray in which the network sees a cloud when it is asked."""
     channels: int = 16
     """Of the network's finest level; 16 gives 0.5 million parameters."""
     width: int = 48
@@ -132,15 +134,16 @@ class SearchConfig:
     """Loss that a part of a hypothesis costs which is turned another way than the network says,
     where the network's votes agree."""
     settle: bool = True
-    """Try all states again for the placement that won."""
+    """Try all states again for the placement that won, where no network says what they are."""
     camera: Literal["known", "estimated"] = "known"
     """Whether the camera is known, or another network, in the principal frames of the learned
     clouds, has to say where it is."""
 
     def __post_init__(self) -> None:
         """Raise ValueError where the network would never be taught."""
-        if self.rounds < 1:
-            raise ValueError(f"rounds: expected at least 1, found {self.rounds}")
+        for name in ("rounds", "looks"):
+            if (number := getattr(self, name)) < 1:
+                raise ValueError(f"{name}: expected at least 1, found {number}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,12 +11,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.geometry.points import Similarity, farthest_points, gather, k_nearest, nearest, normalise
 from scapo.geometry.rigid import rotation_angle
-from scapo.records import cat, take
+from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.records import cat, map_tensors, take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.decode import nearest_weights
 from scapo.registered.joint_limits import JointLimits
@@ -32,6 +34,7 @@ from scapo.registered.template import (
 )
 from scapo.registered.view_network import (
     SMOOTH,
+    TINY,
     ViewNetwork,
     ViewTarget,
     ViewVotes,
@@ -219,16 +222,34 @@ def taught_in_principal_frames(
 
 @torch.no_grad()
 def voted(
-    network: ViewNetwork, template: ArticulatedTemplate, seen: SeenClouds
+    network: ViewNetwork, template: ArticulatedTemplate, seen: SeenClouds, looks: int = 1
 ) -> tuple[Placement, Float[Tensor, "B N P"], Float[Tensor, " B"]]:
-    """What the network says: placement in the clouds' frames, part weights, how sure it is."""
-    turn = seen.views.look
-    points = seen.clean @ turn.mT
-    votes = network(points, seen.normals @ turn.mT, points.shape[1])
+    """What the network says: placement in the clouds' frames, part weights, how sure it is.
+
+    It sees each cloud in as many rolls about the camera's ray as it has looks. What it says in them
+    is averaged, where the base lies as in the look in which the votes agree best.
+    """
+    turns = 2 * torch.pi / looks * torch.arange(looks).to(seen.clean)
+    roll = rotvec_to_rotmat(F.pad(turns[:, None], (2, 0)))
+    turn = (roll[:, None] @ seen.views.look).flatten(0, 1)  # (L B, 3, 3)
+    points, normals = (x.repeat(looks, 1, 1) @ turn.mT for x in (seen.clean, seen.normals))
+    votes = network(points, normals, points.shape[1])
     placement, sure = placed_by_votes(votes, points, template)
+    rotation = (turn.mT @ placement.rotation).unflatten(0, (looks, -1))
+    sure = sure.unflatten(0, (looks, -1))
+    best = rotation[sure.argmax(0), torch.arange(sure.shape[1], device=sure.device)]
+    weight = (rotation_angle(rotation, best.expand_as(rotation)) < OTHER_WAY) * sure.clamp_min(TINY)
+    weight = weight / weight.sum(0)
+
+    def mean(said: Tensor) -> Tensor:
+        share = weight.view(looks, -1, *(1,) * (said.ndim - 1))
+        return (share * said.unflatten(0, (looks, -1))).sum(0)
+
+    votes = map_tensors(votes, mean)
+    placement, sure = placed_by_votes(votes, seen.clean, template)
     if bool(network.hinged):
         placement = replace(placement, pivot=votes.pivot(template))
-    return turn_placement(placement, turn.mT), votes.part.softmax(-1), sure
+    return placement, votes.part.softmax(-1), sure
 
 
 def undeviated(placement: Placement) -> Placement:

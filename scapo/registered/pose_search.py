@@ -84,6 +84,8 @@ ALONE = Effort(
     last=StepOptions(steps=3, points=192),
 )
 """Of one hypothesis of a view, with nothing to rank."""
+OWN = replace(ALONE, last=replace(THOROUGH.last, steps=3))
+"""The same, to be ranked with those of `THOROUGH`."""
 PROPOSED = 32  # Placements that banks propose where fewer are asked for of those that stand right
 STATES = (150.0, 250.0)  # Sharpness of the losses by which the winner's states are tried
 STATE_GRID, STATE_EVERY = 13, 2
@@ -161,6 +163,14 @@ class Hypotheses:
     loss: Float[Tensor, "B F"]
     unlike: Float[Tensor, "B F"]
     """`SearchSpace.unlikeness`, which chooses beside the loss but does not judge templates."""
+
+    def with_others(self, others: Hypotheses) -> Hypotheses:
+        """These and others of the same views."""
+        return Hypotheses(
+            placement=interleave([self.placement, others.placement], len(self.loss)),
+            loss=torch.cat([self.loss, others.loss], 1),
+            unlike=torch.cat([self.unlike, others.unlike], 1),
+        )
 
     def best(self, limits: JointLimits) -> SearchResult:
         """The best of each view; those with states outside the limits are charged for it."""

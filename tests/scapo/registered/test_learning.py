@@ -5,17 +5,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch.testing import assert_close
 
 from scapo.geometry.rigid import rotation_angle
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
-from scapo.registered.learning import UNIT, dissent, taught, undeviated
+from scapo.registered.learning import UNIT, dissent, taught, undeviated, voted
 from scapo.registered.view_network import ViewNetwork
+from scapo.types import Observation
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 from tests.scapo.registered.test_method import trained
+from tests.scapo.registered.test_view_network import perfect
 
 
 def test_candidates_are_placements_in_the_frame_of_the_cloud() -> None:
@@ -91,3 +94,40 @@ def test_deviations_are_told_of_the_best_candidate_alone() -> None:
     found = method._candidates(views.points - views.camera[:, None])
     told = found.placement.deviation.flatten(1).abs().amax(1).view_as(found.gap) > 0
     assert torch.equal(told, found.gap == 0)
+
+
+def test_a_view_is_answered_alike_in_every_quarter_roll() -> None:
+    """By four looks; one look says something else of each."""
+    method, observation = trained(30)
+    assert isinstance(method.network, ViewNetwork)
+    seen = method._seen(observation)
+    quarter = rotvec_to_rotmat(torch.tensor([0, 0, torch.pi / 2]))
+    rolled = replace(seen, views=replace(seen.views, look=quarter @ seen.views.look))
+    for looks, alike in ((4, True), (1, False)):
+        found = [voted(method.network, method.template, one, looks)[0] for one in (seen, rolled)]
+        apart = rotation_angle(found[0].rotation, found[1].rotation).max()
+        assert (float(apart) < 1e-3) == alike
+
+
+def test_a_look_that_means_another_frame_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three looks at perfect votes the second says that the base is turned, and is less sure."""
+    shape = template()
+    views, truth = sighted(3, seed=12)
+    method, _ = trained(0)
+    network = method.network
+    assert isinstance(network, ViewNetwork)
+    seen = replace(
+        method._seen(Observation(points=views.points - views.camera[:, None])),
+        clean=views.points, normals=views.normals, views=views,
+    )  # fmt: skip
+    other = replace(truth, rotation=truth.rotation @ rotvec_to_rotmat(torch.tensor([2.0, 0, 0])))
+    said = cat([perfect(shape, views.points, one) for one in (truth, other, truth)])
+    noise = torch.zeros_like(said.points)
+    noise[3:6] = 0.02 * torch.randn(noise[3:6].shape, generator=generator(1))
+    monkeypatch.setattr(
+        ViewNetwork, "forward", lambda *_: replace(said, points=said.points + noise)
+    )
+    found, part, _ = voted(network, shape, seen, 3)
+    assert rotation_angle(found.rotation, truth.rotation).max() < 1e-3
+    assert_close(found.log_scale, truth.log_scale)
+    assert_close(part, said.part[:3].softmax(-1))
