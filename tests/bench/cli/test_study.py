@@ -25,6 +25,7 @@ def write_run(folder, seed):
     return str(folder)
 
 
+@pytest.mark.slow
 def test_a_study_is_made_once_and_told_on_one_page(tmp_path, capsys) -> None:
     made.make_data(tmp_path / "data", "laptop", count=6, train=9, points=96)
     runs = [write_run(tmp_path / f"run{seed}", seed) for seed in (1, 2)]

@@ -51,7 +51,7 @@ def test_a_plate_far_thinner_than_its_points_are_apart_has_no_holes():
     assert mesh.contains(middle).all()
 
 
-@pytest.mark.parametrize("count", [1000, 4000])
+@pytest.mark.parametrize("count", [1000, pytest.param(4000, marks=pytest.mark.slow)])
 def test_a_large_thin_plate_is_closed(count: int):
     """Its surface is large for its grid, by which `manifold3d.Manifold.level_set` crashed."""
     rng = np.random.default_rng(0)

@@ -210,6 +210,7 @@ def test_rounds_over_the_clouds_that_were_placed():
     assert sum(p.numel() for p in made.parameters()) < 1_500_000
 
 
+@pytest.mark.slow
 def test_the_known_camera_moves_with_the_cloud():
     method, observation = trained()
     turn, move = random_rotations(1, generator(3))[0], torch.tensor([0.3, -0.2, 0.5])

@@ -168,6 +168,7 @@ def test_foreign_and_broken_folders_are_refused(tmp_path):
         generate(request, assets, begun, VERSIONS, HERE)
 
 
+@pytest.mark.slow
 def test_objects_that_die_hang_or_fail_cost_themselves_only(tmp_path):
     """Of five objects one kills its worker, one hangs, one fails and one cannot be read at all."""
     assets = traps(tmp_path, ["", "die", "hang", "raise", "", "raise"])

@@ -35,6 +35,7 @@ def made(folder: Path, source: Path, workers: int) -> tuple[dict[str, bytes], di
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, refused
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_or_stopped_changes_nothing(tmp_path: Path):
     for number in range(5):
         (tmp_path / f"{number}.txt").write_text(f"file {number}")
