@@ -60,11 +60,14 @@ class ViewVotes:
     shift: Float[Tensor, "B J 3"]
     deviation: Float[Tensor, "B J 3"]
     hinge: Float[Tensor, "B J 3"]
-    """Of the object's own hinges from the template's, scaled; template frame."""
+    """Of the object's own hinges from the template's, scaled; template frame. What it has along the
+    axes says nothing."""
 
     def pivot(self, template: ArticulatedTemplate) -> Float[Tensor, "B J 3"]:
         """Where the object's own hinges sit on the base."""
-        return template.pivot.detach() * self.log_scale.detach().exp()[:, None] + self.hinge
+        axis = template.directions().detach()
+        aside = self.hinge - (self.hinge * axis).sum(-1, keepdim=True) * axis
+        return template.pivot.detach() * self.log_scale.detach().exp()[:, None] + aside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

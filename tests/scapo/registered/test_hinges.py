@@ -126,6 +126,8 @@ def test_what_is_learned_of_hinges_changes_nothing_else() -> None:
     g = generator(4)
     points, normals = (0.2 * torch.randn(2, 80, 3, generator=g) for _ in range(2))
     votes: ViewVotes = network(points, normals, 20)
+    along = replace(votes, hinge=votes.hinge + 0.4 * AXIS)
+    assert_close(along.pivot(template()), votes.pivot(template()))
     off = votes.pivot(template()).square().sum()
     off.backward()
     learned = {name for name, value in network.named_parameters() if value.grad is not None}
