@@ -140,13 +140,18 @@ class TemplateRegistration(AbstractRegistered):
     def _hang(self, cloud: Float[Tensor, "B N 3"], labels: Labels) -> None:
         """By the views of each object (`hinges`), where the network knows cameras.
 
+        Views of a laptop take its base for its screen or not, and on each the hinge lies elsewhere.
+
         Raises:
             ValueError: Hinges alone are to be taught, and of no object they are told.
         """
         if labels.instance is None or not isinstance(self.network, ViewNetwork):
             return
+        exchanged = self.category.symmetry is not None and len(self.template.kinds) == 1
+        mixed = exchanged and not bool(self.template.alike)
         size = normalise(replaced(cloud, self.targets.inlier))[1].scale
-        if self.targets.hang(self.template, size, rows_by_object(labels.instance)):
+        objects = [] if mixed else rows_by_object(labels.instance)
+        if self.targets.hang(self.template, size, objects):
             self.network.hinged.fill_(1.0)
         elif self.config.teach == "hinges":
             raise ValueError("teach: expected objects with a hinge and several views, found none")

@@ -213,6 +213,7 @@ def test_hinges_alone_are_taught_to_a_network_that_is_there(
     told = replace(first, labels=Labels(instance=torch.zeros(10, dtype=torch.long)))
     fit.fit(method(begun), told, tmp_path / "second", RUN)
     before, after = (load(tmp_path / name).model for name in ("first", "second"))
+    assert isinstance(after, TemplateRegistration)
     weights, taught = before.state_dict(), after.state_dict()
     changed = {
         name
@@ -225,6 +226,12 @@ def test_hinges_alone_are_taught_to_a_network_that_is_there(
     assert torch.equal(found[0].part_weight, found[1].part_weight)
     pivots = [one.joints.pivot for one in found if one.joints is not None]
     assert (pivots[0] - pivots[1]).abs().max() > 1e-4
+    laptop = TemplateRegistration(begun, CATEGORIES["laptop"], generator(0))
+    laptop.template, laptop.targets = after.template, after.targets
+    assert len(laptop.targets.hinge) == 10
+    with pytest.raises(ValueError, match="objects with a hinge and several views, found none"):
+        laptop._hang(told.observation.points, told.labels)
+    assert laptop.network.hinged == 0
     alone = replace(told, labels=Labels(instance=torch.arange(10)))
     with pytest.raises(ValueError, match="objects with a hinge and several views, found none"):
         fit.fit(method(begun), alone, tmp_path / "third", RUN)
