@@ -177,6 +177,7 @@ def test_the_mirror_image_that_completes_the_base_is_kept(
     assert anywhere == [False, True, True, True]
 
 
+@pytest.mark.slow
 def test_a_mirrored_base_finds_views_of_a_side_that_inliers_never_saw() -> None:
     """The search of a round alone; the base without that side finds few of them."""
     views, truth = sighted(28, seed=91)

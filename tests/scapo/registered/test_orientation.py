@@ -206,6 +206,7 @@ def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -
     assert right(scorer, others, truth) > 0.8 > right(mistaken, others, truth) + 0.1
 
 
+@pytest.mark.slow
 def test_objects_that_know_no_better_than_the_loss_do_not_teach(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -224,6 +224,7 @@ class Wide(Line):
         folder.mkdir(exist_ok=True)
 
 
+@pytest.mark.slow
 def test_steps_side_by_side_are_kept_as_those_one_by_one(tmp_path: Path) -> None:
     """Interrupted after the second of four: two are taken up, whoever made them."""
     here, there = Wide(tmp_path / "a"), Wide(tmp_path / "b", stop=1)
