@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import Category
+from scapo.geometry.part_order import joint_order, part_orders
 from scapo.geometry.rigid import apply, invert, mean_rotation, rigid
 from scapo.geometry.rotations import rotmat_to_rotvec
 from scapo.registered.network import procrustes
@@ -53,12 +54,12 @@ class Target:
 
 
 def exchange(parts: int) -> tuple[list[int], list[int], float]:
-    """Parts and joints in the other order, and the sign of their axes.
+    """Parts and joints in the evaluator's other order, and the sign of their axes.
 
-    As the evaluator relabels: of two parts both, of three the last two with their joints. Where
-    base and child change roles, the joint turns the other way.
+    Where base and child change roles, the joint turns the other way.
     """
-    return ([1, 0], [0], -1.0) if parts == 2 else ([0, 2, 1], [1, 0], 1.0)
+    order = part_orders(parts)[1]
+    return order.tolist(), joint_order(order[None])[0].tolist(), -1.0 if order[0] else 1.0
 
 
 def exchanged(target: Target, symmetry: Float[Tensor, "3 3"]) -> Target:

@@ -70,7 +70,7 @@ def hinges_of_objects(
 def _centre(
     motion: Float[Tensor, "V 4 4"], guess: Float[Tensor, " 3"]
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " V"]]:
-    """P of m = p + R c, and how well each view agrees."""
+    """The p of m = p + R c, and how well each view agrees."""
     turn, move = motion[:, :3, :3], motion[:, :3, 3]
     design = torch.cat([torch.eye(3).to(turn).expand_as(turn), turn], -1)  # (V, 3, 6)
     pull = torch.diag(move.new_tensor(PRIOR).repeat_interleave(3))

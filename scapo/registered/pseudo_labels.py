@@ -138,9 +138,8 @@ class ViewTargets(_Tensors):
     """Candidates as a part of the method's state, which training alone needs."""
 
     PLACEMENT: ClassVar = (*PseudoLabels.PLACEMENT, "deviation")
-    HINGES: ClassVar = ("hinge", "hung")
     NAMES: ClassVar[tuple[str, ...]] = (
-        *(*PLACEMENT, "part", "gap", "trust", "inlier", "normals"), *HINGES,
+        *PLACEMENT, "part", "gap", "trust", "inlier", "normals", "hinge", "hung",
     )  # fmt: skip
     LATER: ClassVar[tuple[str, ...]] = NAMES
     log_scale: Tensor
