@@ -112,6 +112,9 @@ RELEASED = replace(REGISTERED, name="released", seeds=(1,), training=0,
 """What users get: the models that come with the package, in the frame that they answer in."""
 WHOLE = replace(RELEASED, parts=("complete",), modes=("whole",), seconds={"whole": 0.35})
 """The same models, which learned single views, asked about whole surfaces."""
+RELEASED_SCAPO = Entry(method="scapo", name="released-warm", models=("{category}/scapo",),
+                       parts=("clean",), training=0, seconds={"fast": 0.01})  # fmt: skip
+"""The paper's networks, warm start, as they come with the package."""
 BOUND = Entry(method="registered-labelled", parts=("clean", "sensor"), modes=("refine",),
               training=300, seconds={"refine": 0.35})  # fmt: skip
 """What its search can do at best, with a template of true placements."""
@@ -139,7 +142,8 @@ ABLATIONS = tuple(
     for term in ABLATED
 )  # fmt: skip
 """Of Table 3, in the setting in which the method works on single views."""
-GRID = (*NETWORKS, RELEASED, WHOLE, REGISTERED, WARM, WARM_WHOLE, *LABELLED, BOUND, *ABLATIONS)
+GRID = (*NETWORKS, RELEASED, WHOLE, RELEASED_SCAPO, REGISTERED, WARM, WARM_WHOLE, *LABELLED,
+        BOUND, *ABLATIONS)  # fmt: skip
 
 PRESETS: Mapping[PresetName, Preset] = {
     "smoke": Preset(

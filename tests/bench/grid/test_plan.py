@@ -110,6 +110,16 @@ def test_a_released_model_is_asked_by_its_name(tmp_path: Path, monkeypatch):
     assert again[2] == first[2]
 
 
+def test_the_warm_start_that_comes_with_the_package_is_a_row_of_its_own(tmp_path, monkeypatch):
+    model = tmp_path / "oven-scapo"
+    model.write_text("weights")
+    monkeypatch.setattr("bench.grid.plan.weights", lambda: {"oven/scapo": model})
+    found = [c for c in make_plan("cpu", tmp_path).chains if c.label == "released-warm"]
+    assert [c.name for c in found] == ["clean/oven/released-warm/seed1"]
+    assert found[0].steps[0].command[:2] == ("predict", "oven/scapo")
+    assert found[0].steps[0].command[-2:] == ("--row", "released-warm")
+
+
 def test_a_budget_bounds_the_epochs():
     for entry in PRESETS["cpu"].entries:
         flags = flags_of(entry, "cpu", 20.0, 5000)
