@@ -160,6 +160,9 @@ class PredictRequest(RunRequest):
     limit: int | None = None
     """Predict so many clouds alone, evenly spread over the split (500 are enough to calibrate);
     the others have no answer in the file."""
+    up: bool = False
+    """Tell the method which way is up, as robots know it: in these data the z axis of the base. The
+    variant then ends with up."""
     own_frame: bool = False
     """Leave poses, order of parts and states as a method that saw no poses has them, and not in
     the object's frame, where its checkpoint knows that."""
@@ -358,6 +361,9 @@ class InferRequest(ModelRequest):
     """Metres in one unit of the input; by default 0.001 for images of whole numbers, else 1."""
     sensor: tuple[float, float, float] | None = None
     """Centre of the camera in metres, for clouds in another frame than the camera's."""
+    up: tuple[float, float, float] | None = None
+    """Against gravity in the frame of the input (of a level camera 0 -1 0), where that is known and
+    objects stand upright: models of template registration then turn none over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -84,6 +84,13 @@ class Alignment:
             clouds=clouds,
         )
 
+    @property
+    def up(self) -> tuple[float, ...] | None:
+        """Which way is up (z) in the method's own frame of its first part, if that is the base."""
+        if self.order[0] != 0:
+            return None
+        return tuple(row[2] for row in self.own_T_part[0][:3])
+
     def apply(self, found: Prediction, unit: Float[Tensor, "*B"], category: Category) -> Prediction:
         """The prediction by the category's conventions.
 

@@ -219,6 +219,10 @@ class AbstractMethod(nn.Module, ABC):
     """The mode in which users are answered who ask for none."""
     least_points: int = 1
     """Points that a cloud needs to be predicted at all."""
+    takes_up: ClassVar[bool] = False
+    """Whether it uses `Observation.up`."""
+    up: tuple[float, ...] | None = None
+    """Which way is up in the base's own frame, where labels told (`Alignment.up`)."""
     config: Any
     """A frozen dataclass; stored in checkpoints."""
     category: Category

@@ -47,11 +47,17 @@ class Predictor:
         """
         self.model = model.to(device).eval()
         self.device, self.alignment = device, alignment
+        self.model.up = None if alignment is None else alignment.up
 
     @property
     def in_object_frame(self) -> bool:
         """Whether poses, order of parts and states are the category's, not the method's own."""
         return self.alignment is not None or "pose" in self.model.supervision
+
+    @property
+    def knows_up(self) -> bool:
+        """Whether it can be told which way is up."""
+        return self.model.takes_up and self.model.up is not None
 
     def predict(
         self,
@@ -60,6 +66,7 @@ class Predictor:
         sensor: np.ndarray | Tensor | None = None,
         color: np.ndarray | Tensor | None = None,
         *,
+        up: np.ndarray | Tensor | None = None,
         own_frame: bool = False,
     ) -> Prediction:
         """Parts, poses and joints of one cloud or of several.
@@ -74,6 +81,8 @@ class Predictor:
             sensor: (..., 3), centre of the camera, metres, for clouds in another frame than the
                 camera's. What a `registered` model uses.
             color: (..., N, 3), in [0, 1], for methods that look at it.
+            up: (..., 3), against gravity, any length, in the frame of the points, where the object
+                stands as its category does. What a `registered` model uses.
             own_frame: Answer in the method's own frames, order of parts and states.
 
         Returns:
@@ -82,7 +91,7 @@ class Predictor:
 
         Raises:
             ValueError: Another shape, no cloud, fewer points than the method needs, values that
-                are not finite, another mode.
+                are not finite, another mode, an up for a model that cannot use it.
         """
         mode = self.model.usual if mode is None else mode
         if mode not in get_args(Mode):
@@ -109,6 +118,7 @@ class Predictor:
             points=cloud.reshape(-1, *cloud.shape[-2:]),
             color=None if tint is None else tint.reshape(-1, *cloud.shape[-2:]),
             sensor=centre,
+            up=None if up is None else self._unit(up).expand(*shape, 3).reshape(-1, 3),
         )
         prediction = self.model.predict(observation, mode)
         if not own_frame:
@@ -120,6 +130,18 @@ class Predictor:
             return prediction
         unit = unit_length(observation.points)
         return self.alignment.apply(prediction, unit, self.model.category)
+
+    def _unit(self, up: np.ndarray | Tensor) -> Tensor:
+        way = self._tensor(up)
+        length = way.norm(dim=-1, keepdim=True)
+        if not bool((torch.isfinite(length) & (length > 0)).all()):
+            raise ValueError("up: expected finite vectors of some length, found another")
+        if not self.knows_up:
+            raise ValueError(
+                "up: expected a model of template registration that labels told which way is up, "
+                f"found one of {self.model.name} that cannot use it"
+            )
+        return way / length
 
     def _tensor(self, values: np.ndarray | Tensor) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)

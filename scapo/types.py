@@ -41,6 +41,8 @@ class Observation:
     """In [0, 1]."""
     sensor: Float[Tensor, "*B 3"] | None = None
     """Centre of the camera, for clouds in another frame; None: the origin, as in its own."""
+    up: Float[Tensor, "*B 3"] | None = None
+    """Against gravity, unit length, in the frame of the points; None: not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -59,7 +59,7 @@ def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
         InputError: The method says nothing of joints or part poses.
     """
     drawn = _draw(cloud)
-    found = model.predictor.predict(drawn.points, mode, cloud.sensor)
+    found = model.predictor.predict(drawn.points, mode, cloud.sensor, up=cloud.up)
     parts = _parts(name, found, model.category)
     label = np.where(drawn.inlier, _labels(found), BACKGROUND)
     near = KDTree(drawn.points).query(cloud.points)[1]
@@ -97,7 +97,7 @@ def agreement(cloud: Cloud, twin: Twin, model: Model, mode: Mode) -> Twin:
     count = min(POINTS, max(int(RESAMPLED * len(cloud.points)), LEAST_POINTS // 2))
     draws = [cloud.points[rng.choice(len(cloud.points), count, replace=False)]
              for _ in range(RESAMPLES)]  # fmt: skip
-    found = model.predictor.predict(np.stack(draws), mode, cloud.sensor)
+    found = model.predictor.predict(np.stack(draws), mode, cloud.sensor, up=cloud.up)
     others = [_parts(twin.name, _row(found, k), model.category) for k in range(RESAMPLES)]
     poses = np.stack([one.camera_T_part[:, :3, :3] for one in others])
     turn = rotation_degrees(poses, np.broadcast_to(twin.camera_T_part[:, :3, :3], poses.shape))

@@ -38,6 +38,8 @@ class Cloud:
     color: UInt8[np.ndarray, "N 3"] | None = None
     sensor: Float[np.ndarray, 3] | None = None
     """Centre of the camera; None: the origin."""
+    up: Float[np.ndarray, 3] | None = None
+    """Against gravity, any length; None: not known."""
     warnings: tuple[str, ...] = ()
 
     def extent(self) -> Float[np.ndarray, 3]:

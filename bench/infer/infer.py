@@ -14,7 +14,7 @@ from bench.infer.cloud import Cloud, InputError
 from bench.infer.files import Choice, Result, write_result
 from bench.infer.model import Model, load_models
 from bench.infer.readers import ReadOptions, find_inputs, read_input
-from bench.requests import InferRequest, Mode, require_some
+from bench.requests import InferRequest, Mode, UsageError, require_some
 from bench.runs.train import pick_device
 from scapo.text import is_word, one_line
 
@@ -42,17 +42,21 @@ def infer(request: InferRequest, tell: Callable[[Done], None]) -> list[Done]:
 
     Raises:
         StoreError: No model.
-        UsageError: No inputs.
+        UsageError: No inputs, or an up for models that cannot use it.
         InputError: None that can be read, two of one name, or a scale or place that cannot be.
     """
     require_some("INPUT", request.inputs)
     options = ReadOptions(
-        scale=request.scale, intrinsics=request.intrinsics, mask=request.mask, sensor=request.sensor
-    )
+        scale=request.scale, intrinsics=request.intrinsics, mask=request.mask,
+        sensor=request.sensor, up=request.up,
+    )  # fmt: skip
     inputs = find_inputs(request.inputs)
     folders = [request.out / name for name in distinct_names(inputs)]
     device = pick_device(request.device)
     models = load_models(request.checkpoint, request.category, device, request.mode)
+    blind = [model.name for model in models if not model.predictor.knows_up]
+    if request.up is not None and blind:
+        raise UsageError(f"--up: expected models that can use it, found {', '.join(blind)}")
     done = []
     for path, folder in zip(inputs, folders, strict=True):
         done.append(_one(path, folder, models, options, request))

@@ -28,7 +28,7 @@ HEADER = 1 << 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
-    """What a file does not say itself; `scale` above 0 and `sensor` finite, else an InputError."""
+    """What a file does not say itself; numbers that cannot be are an InputError."""
 
     scale: float | None = None
     """Metres in the unit of the input."""
@@ -38,14 +38,19 @@ class ReadOptions:
     """Of a depth image: which pixels show the object."""
     sensor: tuple[float, float, float] | None = None
     """Centre of the camera in the cloud's frame, metres."""
+    up: tuple[float, float, float] | None = None
+    """Against gravity, in the cloud's frame."""
 
     def __post_init__(self) -> None:
         """Refuse numbers that no unit and no place can be."""
         if self.scale is not None and not (isfinite(self.scale) and self.scale > 0):
             raise InputError(f"--scale: expected a finite number above 0, found {self.scale:g}")
-        if self.sensor is not None and not all(map(isfinite, self.sensor)):
-            found = " ".join(f"{value:g}" for value in self.sensor)
-            raise InputError(f"--sensor: expected 3 finite numbers, found {found}")
+        for name, place in (("sensor", self.sensor), ("up", self.up)):
+            if place is not None and not all(map(isfinite, place)):
+                found = " ".join(f"{value:g}" for value in place)
+                raise InputError(f"--{name}: expected 3 finite numbers, found {found}")
+        if self.up is not None and not any(self.up):
+            raise InputError("--up: expected a direction, found 0 0 0")
 
 
 def find_inputs(paths: Sequence[Path]) -> list[Path]:
@@ -92,6 +97,8 @@ def read_input(path: Path, options: ReadOptions) -> Cloud:
     cloud = _read_cloud(path, suffix, options.scale)
     if options.sensor is not None:
         cloud = replace(cloud, sensor=np.array(options.sensor, np.float64))
+    if options.up is not None:
+        cloud = replace(cloud, up=np.array(options.up, np.float64))
     return check_sensor(cloud)
 
 

@@ -51,7 +51,8 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         what it takes to load it and to read the clouds.
 
     Raises:
-        ValueError: `oracle` for a method that cannot use labels; no clouds at all, or at a time.
+        ValueError: `oracle` for a method that cannot use labels, `up` for one that has no use for
+            it; no clouds at all, or at a time.
         StoreError: No checkpoint, no such data, or a file of another suffix to write.
     """
     require_suffix(request.out, ".safetensors")
@@ -66,6 +67,9 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     known = check_header(header, str(run)).alignment
     alignment = None if request.own_frame else known
     oracle = _oracle_words(method) if request.oracle else []
+    method.up = None if known is None else known.up
+    if request.up and not (method.takes_up and method.up is not None):
+        raise ValueError(f"--up: expected a model that can use it, found {method.name}")
     split = open_split(request.data, header["category"], request.split)
     samples = SampleDataset(split, observed(split))
     chosen = evenly(len(samples), request.limit)
@@ -77,6 +81,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         parts.append(_answer(request, method, batch, device, alignment))  # waits for the device
         seconds += time.perf_counter() - started
     words = [request.row or method.variant, "" if request.mode == "fast" else request.mode, *oracle]
+    words += ["up"] * request.up
     budget = {
         "device": device,
         "processor": _processor(device),
@@ -140,6 +145,8 @@ def _answer(
     """The tensors of a predictions file for some samples."""
     batch = map_tensors(samples, lambda tensor: tensor.to(device))
     observation = observe(batch)
+    if request.up:
+        observation = replace(observation, up=batch["camera_T_part"][:, 0, :3, 2])
     if request.oracle and isinstance(method, OracleMethod):
         return to_arrays(method.predict_given(observation, label(batch).keep(method.oracle)))
     found = method.predict(observation, request.mode)

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, ClassVar
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -53,8 +52,6 @@ from scapo.registered.pose_search import (
     SearchResult,
     SearchSpace,
     grid_of_states,
-    light,
-    modes_of,
     most_confident,
     refine_states,
     successive_halving,
@@ -67,7 +64,8 @@ from scapo.registered.template import (
     interleave,
     turn_placement,
 )
-from scapo.registered.view_bank import ShownPoints, ViewBank
+from scapo.registered.upright import Upright
+from scapo.registered.view_bank import ShownPoints
 from scapo.registered.view_network import ViewNetwork
 from scapo.registered.views import NEIGHBOURS, PartialViews, observe, surface_normals
 from scapo.types import Labels, Observation, Prediction
@@ -90,6 +88,7 @@ class AbstractRegistered(AbstractMethod):
     networks: ClassVar[tuple[str, ...]] = ("network",)
     usual: ClassVar[Mode] = "quick"
     least_points = NEIGHBOURS
+    takes_up = True
 
     def __init__(
         self, config: SearchConfig, category: Category, generator: torch.Generator
@@ -315,7 +314,7 @@ class AbstractRegistered(AbstractMethod):
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Parts, poses and joints."""
         if mode == "whole":
-            return self._of_surfaces(observation.points.to(self.template.points))
+            return self._of_surfaces(map_tensors(observation, lambda x: x.to(self.template.points)))
         seen = self._seen(observation)
         if mode == "fast" and self._has_learned():
             chosen, weight, confidence = self._voted(seen)
@@ -325,7 +324,7 @@ class AbstractRegistered(AbstractMethod):
         chosen = turn_placement(chosen, seen.frame.mT)
         return self._answer(chosen, weight, seen.similarity, confidence)
 
-    def _of_surfaces(self, points: Float[Tensor, "B N 3"]) -> Prediction:
+    def _of_surfaces(self, observation: Observation) -> Prediction:
         """Of clouds that show all of an object, not the side that a camera sees.
 
         Raises:
@@ -336,9 +335,11 @@ class AbstractRegistered(AbstractMethod):
                 "mode whole: expected a model whose network learned views of a known camera, "
                 "found one without"
             )
-        clouds, similarity = normalise(points)
+        clouds, similarity = normalise(observation.points)
         away = float(self.pseudo.camera[self.pseudo.trust > 0].norm(dim=1).median())
         placement, sure = lying(self.template, self._of_view, away, clouds)
+        if (upright := self._upright(observation.up)) is not None:
+            placement = upright.raised(self.template, placement)
         normals = torch.zeros_like(clouds)  # Which way a surface faces is not known
         weight = nearest_weights(self.template, clouds, normals, placement)
         return self._answer(placement, weight, similarity, sure)
@@ -378,7 +379,16 @@ class AbstractRegistered(AbstractMethod):
             similarity=similarity,
             inlier=inlier,
             normals=normals,
+            up=None if observation.up is None else (frame @ observation.up[..., None])[..., 0],
         )
+
+    def _upright(self, up: Float[Tensor, "B 3"] | None) -> Upright | None:
+        """The up of clouds beside the template's, if it is known."""
+        if up is None:
+            return None
+        if self.up is None:
+            raise ValueError("up: expected a model in the object's frame, whose base comes first")
+        return Upright(own=torch.tensor(self.up).to(up), seen=up)
 
     def _voted(
         self, seen: SeenClouds
@@ -387,8 +397,13 @@ class AbstractRegistered(AbstractMethod):
         if isinstance(self.network, PointVotes):
             kept = seen.views.points
             placement, votes, sure = surest(self.network, kept)
-            return placement, gather(votes.part.softmax(-1), nearest(seen.points, kept)), sure
-        return voted(self.network, self.template, seen, self.config.looks)
+            weight = gather(votes.part.softmax(-1), nearest(seen.points, kept))
+        else:
+            placement, weight, sure = voted(self.network, self.template, seen, self.config.looks)
+        if (upright := self._upright(seen.up)) is not None:
+            sure = sure * (1 - upright.leaning(placement.rotation)).clamp(0, 1)
+            placement = upright.raised(self.template, placement)
+        return placement, weight, sure
 
     def _answer(
         self,
@@ -425,6 +440,8 @@ class AbstractRegistered(AbstractMethod):
             final = refine_states(self.template, seen.views, found, self._limits())
         if self.template.deviates():
             final, _ = refine_deviations(self.template, seen.views, final)
+        if (upright := self._upright(seen.up)) is not None:
+            final = upright.raised(self.template, final)
         return final if said is None else hinged_as(self.template, said[0], final), found.margin
 
     def _said(self, seen: SeenClouds) -> Said | None:
@@ -440,19 +457,22 @@ class AbstractRegistered(AbstractMethod):
         if refine:
             found = self._settled(seen, said, config.grid_hypotheses, THOROUGH)
             return found if said is None else found.with_others(self._settled(seen, said, 0, OWN))
-        beside = config.quick_beside if learned else config.quick_hypotheses
+        alone = learned and seen.up is None  # what the network had upside down is looked for
+        beside = config.quick_beside if alone else config.quick_hypotheses
         return self._settled(seen, said, beside, BRIEF if beside else ALONE)
 
     def _settled(self, seen: SeenClouds, said: Said | None, beside: int, by: Effort) -> Hypotheses:
         """What is left of the network's and `beside` more, charged where it dissents."""
-        views, space = seen.views, self._space()
-        if said is None:
-            start = self._without_network(views, beside)
-            return successive_halving(self.template, views, start, space, by)
-        start = undeviated(said[0])
-        if beside:
+        views, upright = seen.views, self._upright(seen.up)
+        space = replace(self._space(), upright=upright)
+        start = self._without_network(views, beside) if said is None else undeviated(said[0])
+        if said is not None and beside:
             start = interleave([start, space.propose(views, beside)], len(views.points))
+        if upright is not None:
+            start = upright.raised(self.template, start)
         left = successive_halving(self.template, views, start, space, by)
+        if said is None:
+            return left
         charge = dissent(self.template, *said, left.placement, self.config.dissent)
         return replace(left, unlike=left.unlike + charge)
 
@@ -474,24 +494,6 @@ class AbstractRegistered(AbstractMethod):
         shape = [*self.template.state_dict(keep_vars=True).values(), *self.pseudo.buffers()]
         key = [(id(tensor), tensor._version, tensor.device) for tensor in shape]
         if self._drawn is None or self._drawn[0] != key:
-            self._drawn = key, self._draw()
+            states = grid_of_states(self._limits().wider(ROOM))
+            self._drawn = key, self.pseudo.space(self.template, states, self.orientation)
         return self._drawn[1]
-
-    def _draw(self) -> SearchSpace:
-        learned = self.pseudo.trust > 0
-        states = grid_of_states(self._limits().wider(ROOM))
-        placement = take(self.pseudo.placement(), learned)
-        camera = F.normalize(self.pseudo.camera[learned], dim=-1)
-        placed = None
-        if len(self.pseudo.points):
-            shown = ShownPoints(
-                points=self.pseudo.points[learned], normals=self.pseudo.normals[learned]
-            )
-            placed = ViewBank.placed(self.template, shown, placement, camera)
-        modes = modes_of(placement, states)
-        return SearchSpace(
-            rendered=ViewBank.rendered(light(self.template), modes, camera),
-            placed=placed,
-            states=states,
-            scorer=self.orientation,
-        )

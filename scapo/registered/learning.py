@@ -70,6 +70,8 @@ class SeenClouds:
     inlier: Bool[Tensor, "B N"]
     normals: Float[Tensor, "B N 3"]
     """Of `clean`, towards the camera."""
+    up: Float[Tensor, "B 3"] | None = None
+    """Against gravity, where that is known."""
 
     def part_weights(
         self, template: ArticulatedTemplate, placement: Placement

@@ -26,6 +26,7 @@ from scapo.registered.pairwise import distinct, within
 from scapo.registered.pose_refinement import CHUNK, LIGHT, StepOptions, refine, search_states
 from scapo.registered.synchronisation import densest
 from scapo.registered.template import ArticulatedTemplate, Placement, interleave
+from scapo.registered.upright import LEANING, OVER, Upright
 from scapo.registered.view_bank import ShownPoints, ViewBank
 from scapo.registered.views import PartialViews
 
@@ -110,18 +111,26 @@ class SearchSpace:
     """Tried again before the last steps."""
     scorer: OrientationScorer | None = None
     """Of how objects stand."""
+    upright: Upright | None = None
+    """Of all views that are searched, where their up is known."""
 
     @torch.no_grad()
     def propose(self, views: PartialViews, count: int) -> Placement:
         """So many distinct placements of each view, those of a view in a row.
 
-        Of more that the banks propose, where it is known how objects stand.
+        Of more that the banks propose, where it is known how objects stand or which way is up.
         """
-        if self.scorer is None or not bool(self.scorer.learned) or count >= PROPOSED:
+        known = self.scorer is not None and bool(self.scorer.learned)
+        if (not known and self.upright is None) or count >= PROPOSED:
             return self._looking_alike(views, count)
         found = self._looking_alike(views, PROPOSED)
         turns = found.rotation.unflatten(0, (len(views.points), PROPOSED))
-        best = self.scorer(views, turns).topk(count, 1).indices
+        score = torch.zeros_like(turns[..., 0, 0])
+        if self.scorer is not None and known:
+            score = score + self.scorer(views, turns)
+        if self.upright is not None:
+            score = score - OVER * self.upright.leaning(turns)
+        best = score.topk(count, 1).indices
         first = PROPOSED * torch.arange(len(best), device=best.device)
         return take(found, (best + first[:, None]).flatten())
 
@@ -140,6 +149,8 @@ class SearchSpace:
     ) -> Float[Tensor, "B F"]:
         """What hypotheses are charged for: looking like none that was placed, standing oddly."""
         charge = torch.zeros_like(rotation[..., 0, 0])
+        if self.upright is not None:
+            charge = charge + LEANING * self.upright.leaning(rotation)
         if self.placed is not None:
             charge = charge + self.placed.unlikeness(views, rotation)
         return charge if self.scorer is None else charge + self.scorer.charge(views, rotation)

@@ -8,14 +8,17 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Int8, UInt8
 from torch import Tensor, nn
 
 from scapo.geometry.points import Similarity
 from scapo.records import take
 from scapo.registered.hinges import as_placed_by, hinges_of_objects
+from scapo.registered.orientation import OrientationScorer
+from scapo.registered.pose_search import SearchSpace, light, modes_of
 from scapo.registered.template import ArticulatedTemplate, Placement
-from scapo.registered.view_bank import ShownPoints
+from scapo.registered.view_bank import ShownPoints, ViewBank
 from scapo.registered.views import PartialViews
 
 
@@ -132,6 +135,21 @@ class PseudoLabels(_Tensors):
         """All of them, about the category's axes."""
         values = {name: getattr(self, name) for name in self.PLACEMENT}
         return Placement(**values, deviation=torch.zeros_like(self.shift))
+
+    def space(
+        self, template: ArticulatedTemplate, states: Tensor, scorer: OrientationScorer
+    ) -> SearchSpace:
+        """States, shifts, sizes, cameras and looks of the clouds that are learned."""
+        learned = self.trust > 0
+        placement = take(self.placement(), learned)
+        camera = F.normalize(self.camera[learned], dim=-1)
+        placed = None
+        if len(self.points):
+            shown = ShownPoints(points=self.points[learned], normals=self.normals[learned])
+            placed = ViewBank.placed(template, shown, placement, camera)
+        modes = modes_of(placement, states)
+        rendered = ViewBank.rendered(light(template), modes, camera)
+        return SearchSpace(rendered=rendered, placed=placed, states=states, scorer=scorer)
 
 
 class ViewTargets(_Tensors):

@@ -35,6 +35,18 @@ def test_conventions_are_undone(name: str, order: tuple[int, ...]) -> None:
         assert_close(getattr(found.joints, field), getattr(truth.joints, field), atol=1e-9, rtol=0)
 
 
+def test_up_is_told_in_the_own_frame_of_a_base_that_comes_first() -> None:
+    category, rng = CATEGORIES["eyeglasses"], np.random.default_rng(4)
+    own, truth = convention((0, 2, 1), rng), true_answers(category, 3, rng)
+    said = in_own_words(truth, own, UNIT, category).camera_T_part
+    assert own.up is not None
+    assert said is not None
+    assert truth.camera_T_part is not None
+    up = said[:, 0, :3, :3] @ torch.tensor(own.up, dtype=torch.float64)
+    assert_close(up, truth.camera_T_part[:, 0, :3, 2], atol=1e-9, rtol=0)
+    assert convention((1, 0), rng).up is None
+
+
 def test_a_shape_whose_parts_nobody_knows_is_left_out_and_what_is_not_said_stays_so() -> None:
     category, rng = CATEGORIES["oven"], np.random.default_rng(1)
     truth = true_answers(category, 3, rng)

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from torch.testing import assert_close
 
 from scapo.alignment import unit_length
 from scapo.categories import CATEGORIES
+from scapo.geometry.rigid import axis_angle, rotation_angle
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.method import Scapo
 from scapo.predictor import Predictor, load
 from scapo.registered.config import RegisteredConfig
@@ -86,6 +89,29 @@ def test_another_mode_is_refused_with_those_there_are(saved: Path) -> None:
     words = "mode: expected one of fast, quick, refine, whole, found 'best'"
     with pytest.raises(ValueError, match=words):
         inspect.unwrap(Predictor.predict)(load(saved), plates(1, 96)[0].points, "best")
+
+
+def test_a_cloud_stands_as_it_is_said_to() -> None:
+    points = load_file("results/checks/oven.safetensors")["points"][:3]
+    model = load("oven")
+    pose = model.predict(points).camera_T_part
+    assert pose is not None
+    up = pose[..., :3, 2] @ rotvec_to_rotmat(torch.tensor([0.02, -0.03, 0.04]))
+    found = model.predict(points, up=7 * up[:, 0]).camera_T_part
+    assert found is not None
+    assert axis_angle(found[:, 0, :3, 2], up[:, 0]).max() < 2e-3
+    alike = model.predict(points[0], up=up[0, 0].numpy()).camera_T_part
+    assert alike is not None
+    assert rotation_angle(alike[:, :3, :3], found[0, :, :3, :3]).max().rad2deg() < 1
+
+
+def test_an_up_that_nobody_can_use_is_refused(saved: Path) -> None:
+    points = plates(3, 96)[0].points
+    with pytest.raises(ValueError, match="up: expected a model of template registration"):
+        load(saved).predict(points, up=np.array([0.0, -1, 0]))
+    for wrong in (np.zeros(3), np.array([np.nan, 0, 1])):
+        with pytest.raises(ValueError, match="up: expected finite vectors of some length"):
+            load(saved).predict(points, up=wrong)
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:

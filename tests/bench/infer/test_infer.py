@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors.numpy import load_file
 from scipy.spatial.transform import Rotation
 
 from bench import __main__ as program
@@ -88,6 +89,28 @@ def test_a_scale_of_zero_is_refused_for_clouds_and_images(name, run, tmp_path, c
     out = tmp_path / "out"
     assert call("infer", tmp_path / name, "--run", run, "--out", out, "--scale", "0") == 1
     assert "--scale: expected a finite number above 0, found 0" in capsys.readouterr().err
+
+
+def test_an_up_is_refused_that_is_no_direction_or_of_no_use(run, tmp_path, capsys):
+    words = ("infer", tmp_path / "a.npz", "--run", run, "--out", tmp_path / "out", "--up")
+    assert call(*words, "0", "0", "0") == 1
+    assert "--up: expected a direction, found 0 0 0" in capsys.readouterr().err
+    assert call(*words, "0", "-1", "nan") == 1
+    assert "--up: expected 3 finite numbers, found 0 -1 nan" in capsys.readouterr().err
+    assert call(*words, "0", "-1", "0") == 2
+    assert "--up: expected models that can use it, found oven" in capsys.readouterr().err
+
+
+def test_a_cloud_stands_as_it_is_said_to(tmp_path, capsys):
+    points = load_file("results/checks/oven.safetensors")["points"][0]
+    np.savez(tmp_path / "a.npz", points=points)
+    up = np.array([0.1, -0.9, -0.4])
+    out = tmp_path / "out"
+    assert call("infer", tmp_path / "a.npz", "--category", "oven", "--out", out, "--up", *up) == 0
+    capsys.readouterr()
+    record = json.loads((out / "a" / "joints.json").read_text())
+    pose = np.array(record["parts"][0]["camera_T_part"])
+    np.testing.assert_allclose(pose[:3, 2], up / np.linalg.norm(up), atol=2e-3)
 
 
 def test_no_input_is_wrong_usage(tmp_path, capsys):
