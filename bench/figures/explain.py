@@ -100,13 +100,17 @@ def _bars(
     colors: Sequence[str] | None = None,
     turned: bool = False,
 ) -> None:
-    for place, value in enumerate(values):
-        if value.count:
-            below, above = max(0.0, value.mean - value.low), max(0.0, value.high - value.mean)
-            axes.bar(place, value.mean, color=colors[place] if colors else BAR)
-            axes.errorbar(place, value.mean, [[below], [above]], color=EDGE, capsize=2, lw=1)
-        else:
-            axes.text(place, 0, "–", ha="center", va="bottom")
+    known = [place for place, value in enumerate(values) if value.count]
+    some = [values[place] for place in known]
+    means = [value.mean for value in some]
+    reach = [
+        [max(0.0, value.mean - value.low) for value in some],
+        [max(0.0, value.high - value.mean) for value in some],
+    ]
+    axes.bar(known, means, color=[colors[place] for place in known] if colors else BAR)
+    axes.errorbar(known, means, reach, fmt="none", ecolor=EDGE, capsize=2, elinewidth=1)
+    for place in sorted({*range(len(values))} - {*known}):
+        axes.text(place, 0, "–", ha="center", va="bottom")
     axes.set_xticks(range(len(labels)), labels, fontsize=7, rotation=60 if turned else 0)
     axes.tick_params(axis="y", labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)

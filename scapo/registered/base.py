@@ -353,10 +353,7 @@ class AbstractRegistered(AbstractMethod):
         return turn_placement(placement, seen.frame.mT), sure, seen.similarity
 
     def _has_learned(self) -> bool:
-        """Whether there is a network to ask: not in models from before cameras were asked for it.
-
-        One that was never trained has nothing else.
-        """
+        """Whether the network can be asked; of a method that was never trained there is no more."""
         if isinstance(self.network, PointVotes) or not len(self.pseudo.state):
             return True
         return bool(self.network.learned)

@@ -12,7 +12,6 @@ the right one among turns about the frame's axes.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -207,15 +206,3 @@ class OrientationScorer(nn.Module):
         score = self._score(surface, camera[:, :, 0], kept)
         right = torch.zeros(count, dtype=torch.long)
         return F.cross_entropy(score, right, label_smoothing=SMOOTHED)
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        *rest: Any,  # noqa: ANN401 - as torch calls it
-        **named: Any,  # noqa: ANN401
-    ) -> None:
-        """Checkpoints from before there was one have none that was taught."""
-        for name, value in self.state_dict().items():
-            state_dict.setdefault(prefix + name, value)
-        super()._load_from_state_dict(state_dict, prefix, *rest, **named)

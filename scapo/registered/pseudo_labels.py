@@ -60,8 +60,6 @@ class _Tensors(nn.Module):
     """Named tensors whose size is that of what was stored."""
 
     NAMES: ClassVar[tuple[str, ...]]
-    LATER: ClassVar[tuple[str, ...]] = ()
-    """Those that older checkpoints lack; they then stay empty."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -76,8 +74,6 @@ class _Tensors(nn.Module):
         **named: Any,  # noqa: ANN401
     ) -> None:
         """Take the size of what is loaded."""
-        for name in self.LATER:
-            state_dict.setdefault(prefix + name, torch.zeros(0))
         for name, own in self.named_buffers():
             if prefix + name in state_dict:
                 empty = torch.zeros_like(state_dict[prefix + name], device=own.device)
@@ -106,8 +102,7 @@ class PseudoLabels(_Tensors):
     """Which points of each cloud are inliers (bool)."""
     PLACEMENT: ClassVar = ("rotation", "translation", "log_scale", "state", "shift")
     SET: ClassVar = ("key", *PLACEMENT, "camera", "trust")
-    LATER: ClassVar[tuple[str, ...]] = ("points", "normals")
-    NAMES: ClassVar[tuple[str, ...]] = (*SET, *LATER)
+    NAMES: ClassVar[tuple[str, ...]] = (*SET, "points", "normals")
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,7 +154,6 @@ class ViewTargets(_Tensors):
     NAMES: ClassVar[tuple[str, ...]] = (
         *PLACEMENT, "part", "gap", "trust", "inlier", "normals", "hinge", "hung",
     )  # fmt: skip
-    LATER: ClassVar[tuple[str, ...]] = NAMES
     log_scale: Tensor
     shift: Tensor
     deviation: Tensor

@@ -9,7 +9,6 @@ scales along the template's axes, and where on the body each joint sits.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -29,7 +28,7 @@ normals of a plate's two faces differ by 2."""
 PART_LENGTH = 0.1
 """That of a unit of part weights, so that small parts are sampled along their borders too."""
 BUFFERS = ("rest", "load", "noise", "alike")
-"""What older templates were saved without."""
+"""What is known of the axes and parts beside the shape."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,18 +110,6 @@ class ArticulatedTemplate(nn.Module):
         self.register_buffer("load", torch.zeros(2 * len(kinds)))
         self.register_buffer("noise", torch.eye(2 * len(kinds)))
         self.register_buffer("alike", torch.zeros(()))
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        *rest: Any,  # noqa: ANN401 - as torch calls it
-        **named: Any,  # noqa: ANN401
-    ) -> None:
-        """Of a template that was saved without them axes are the category's, parts unlike."""
-        for name in BUFFERS:
-            state_dict.setdefault(prefix + name, getattr(self, name))
-        super()._load_from_state_dict(state_dict, prefix, *rest, **named)
 
     @torch.no_grad()
     def assign(

@@ -17,7 +17,7 @@ common decides which way an object of two like halves lies.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -195,27 +195,6 @@ class ViewNetwork(nn.Module):
             # What else it learns does not change for what it says of hinges.
             hinge=self.hinge(code.detach()).unflatten(1, (j, 3)),
         )
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, Any],
-        prefix: str,
-        *rest: Any,  # noqa: ANN401 - as torch calls it
-        **named: Any,  # noqa: ANN401
-    ) -> None:
-        """Checkpoints from before hold another network, which is left: this one is not taught.
-
-        Some hold this one, not yet taught where hinges sit.
-        """
-        own = self.state_dict()
-        lacking = [name for name in own if name.startswith("hinge")]
-        if prefix + "learned" not in state_dict:
-            lacking = list(own)
-            for name in [name for name in state_dict if name.startswith(prefix)]:
-                del state_dict[name]
-        for name in lacking:
-            state_dict.setdefault(prefix + name, own[name])
-        super()._load_from_state_dict(state_dict, prefix, *rest, **named)
 
 
 class PlainViewVotes(nn.Module):

@@ -16,7 +16,7 @@ from bench.scoring.score_files import read_scores
 from tests.helpers import made
 
 
-@pytest.mark.parametrize("category", ["laptop", "eyeglasses"])
+@pytest.mark.parametrize("category", ["laptop", pytest.param("eyeglasses", marks=pytest.mark.slow)])
 def test_the_example_runs(repository, tmp_path, category, monkeypatch):
     page = (repository / "docs" / "bring-your-own-method.md").read_text()
     code = re.search(r"```python\n(.*?)```", page, re.DOTALL)

@@ -53,7 +53,11 @@ def test_a_prediction_goes_over_all_points_in_thin_clouds(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "pose", "steps"),
-    [("pointnet2", "votes", 100), ("pointnet2", "pooled", 100), ("gcn3d", "votes", 150)],
+    [
+        ("pointnet2", "votes", 100),
+        ("pointnet2", "pooled", 100),
+        pytest.param("gcn3d", "votes", 150, marks=pytest.mark.slow),
+    ],
 )
 def test_one_batch_is_learned_by_heart(name: str, pose: str, steps: int) -> None:
     """From its own objective to the benchmark's errors of the same clouds."""

@@ -145,6 +145,7 @@ def wait_for(holds, seconds: float = 120.0):
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_on_ray_the_outcomes_are_the_same(folder: Path, monkeypatch):
     """The engine is asked for with the GPUs of a chain; the pool itself is tested where it is."""
     asked = []

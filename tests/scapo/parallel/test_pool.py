@@ -179,6 +179,7 @@ def spin_or_wait(job: tuple[Path, str], report) -> str:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="the system does not tell")
+@pytest.mark.slow
 def test_who_spins_is_at_fault_and_who_waits_is_not(tmp_path: Path):
     """The first attempt has `within` seconds; a slow machine has the pool's timeout after it."""
     log = tmp_path / "log"

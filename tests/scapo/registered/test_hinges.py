@@ -134,17 +134,6 @@ def test_what_is_learned_of_hinges_changes_nothing_else() -> None:
     assert learned == {"hinge.weight", "hinge.bias"}
 
 
-def test_a_network_from_before_says_nothing_of_hinges() -> None:
-    made = ViewNetwork(2, 1, channels=4)
-    made.learned.fill_(1.0)
-    made.hinged.fill_(1.0)
-    before = {name: value for name, value in made.state_dict().items() if "hinge" not in name}
-    again = ViewNetwork(2, 1, channels=4)
-    again.load_state_dict(before)
-    assert again.learned == 1
-    assert again.hinged == 0
-
-
 def test_hinges_are_the_networks_where_both_mean_the_same_frame() -> None:
     shape = template()
     said, _ = seen(shape, torch.tensor([0.3, 0, 0]), torch.zeros(3), seed=5)

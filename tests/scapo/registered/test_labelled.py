@@ -136,7 +136,7 @@ def test_drawers_sit_where_they_sit_on_each_body() -> None:
     assert loss_of(method.template, views, found) < 0.9 * loss_of(method.template, views, centred)
 
 
-@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("kind", ["revolute", pytest.param("prismatic", marks=pytest.mark.slow)])
 def test_refinement_answers_in_the_true_frames(kind: JointKind) -> None:
     seen = SEEN if kind == "revolute" else objects(6, 5, kind="prismatic", seed=2)
     method = started(seen, kind)

@@ -121,15 +121,6 @@ def test_a_lighter_template_has_the_first_points_and_the_same_joints():
     assert torch.equal(repeated.points[20:40], template.points)
 
 
-def test_a_template_saved_without_deviations_has_none():
-    template, placement = drawn("revolute")
-    saved = {k: v for k, v in template.state_dict().items() if k not in ("rest", "load", "noise")}
-    back = ArticulatedTemplate(("revolute",), 20)
-    back.load_state_dict(saved)
-    assert not back.deviates()
-    assert_close(back.place(placement), template.place(placement))
-
-
 @pytest.mark.parametrize("axis", [OUT, UP, torch.tensor([0.6, 0.0, 0.8])])
 def test_across_an_axis(axis: Tensor):
     frame = torch.stack([axis, *across_axis(axis)])

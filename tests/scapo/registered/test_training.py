@@ -206,6 +206,7 @@ def test_a_run_begins_at_another_ones_template_and_refuses_what_does_not_fit(
         method(larger).start("votes", clouds(10), Labels(), g)
 
 
+@pytest.mark.slow
 def test_hinges_alone_are_taught_to_a_network_that_is_there(
     first: TrainingData, tmp_path: Path
 ) -> None:

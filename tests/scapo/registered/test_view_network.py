@@ -217,19 +217,3 @@ def test_points_that_do_not_vote_are_seen_all_the_same() -> None:
     assert_close(few.points, all_of_them.points[:, :20])
     without = network(points[:, :20], normals[:, :20], 20)
     assert (without.points - few.points).abs().max() > 1e-4
-
-
-def test_weights_of_another_network_are_left_and_it_counts_as_not_taught() -> None:
-    network = ViewNetwork(2, 1, channels=4)
-    network.learned.fill_(1.0)
-    stored = network.state_dict()
-    again = ViewNetwork(2, 1, channels=4)
-    again.load_state_dict(stored)
-    assert again.learned == 1
-    before = again.state_dict()
-    again.learned.fill_(0.0)
-    again.load_state_dict({"edge.0.weight": torch.zeros(3, 3)})
-    assert again.learned == 0
-    assert again.hinged == 0
-    assert all(torch.equal(before[name], value) for name, value in again.state_dict().items()
-               if name != "learned")  # fmt: skip

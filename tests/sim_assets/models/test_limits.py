@@ -205,7 +205,10 @@ def largest() -> int:
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 
-@pytest.mark.parametrize("form", ["stl", "obj", "ply", "glb", "dae"])
+@pytest.mark.parametrize(
+    "form",
+    ["ply", "glb", *(pytest.param(form, marks=pytest.mark.slow) for form in ("stl", "obj", "dae"))],
+)
 def test_a_good_model_of_many_triangles_is_read(form: str, tmp_path: Path):
     count, _, size = large(tmp_path, form, 20_000)
     assert int(count) == 12 * 41**2 + 12
