@@ -112,18 +112,17 @@ class Predictor:
         centre = None if sensor is None else self._tensor(sensor).expand(*shape, 3).reshape(-1, 3)
         tint = None if color is None else self._tensor(color)
         if tint is not None and tint.shape != cloud.shape:
-            expected, found = tuple(cloud.shape), tuple(tint.shape)
-            raise ValueError(f"color: expected the shape of points, {expected}, found {found}")
+            wanted, other = tuple(cloud.shape), tuple(tint.shape)
+            raise ValueError(f"color: expected the shape of points, {wanted}, found {other}")
         observation = Observation(
             points=cloud.reshape(-1, *cloud.shape[-2:]),
             color=None if tint is None else tint.reshape(-1, *cloud.shape[-2:]),
             sensor=centre,
             up=None if up is None else self._unit(up).expand(*shape, 3).reshape(-1, 3),
         )
-        prediction = self.model.predict(observation, mode)
-        if not own_frame:
-            prediction = self._in_object_frame(prediction, observation)
-        return map_tensors(prediction, lambda one: one.reshape((*shape, *one.shape[1:])).cpu())
+        found = self.model.predict(observation, mode)
+        found = found if own_frame else self._in_object_frame(found, observation)
+        return map_tensors(found, lambda one: one.reshape((*shape, *one.shape[1:])).cpu())
 
     def _in_object_frame(self, prediction: Prediction, observation: Observation) -> Prediction:
         if self.alignment is None:

@@ -67,9 +67,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     known = check_header(header, str(run)).alignment
     alignment = None if request.own_frame else known
     oracle = _oracle_words(method) if request.oracle else []
-    method.up = None if known is None else known.up
-    if request.up and not (method.takes_up and method.up is not None):
-        raise ValueError(f"--up: expected a model that can use it, found {method.name}")
+    _tell_up(method, known, request)
     split = open_split(request.data, header["category"], request.split)
     samples = SampleDataset(split, observed(split))
     chosen = evenly(len(samples), request.limit)
@@ -95,6 +93,17 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     made = replace(made, object_frame=ObjectFrame.of(alignment))
     write_predictions(request.out, made, joined(parts, chosen.numpy(), len(samples)))
     return len(chosen), seconds / len(chosen)
+
+
+def _tell_up(method: AbstractMethod, known: Alignment | None, request: PredictRequest) -> None:
+    """Which way is up in the method's own frame.
+
+    Raises:
+        ValueError: It is to be told more and cannot use it.
+    """
+    method.up = None if known is None else known.up
+    if request.up and not (method.takes_up and method.up is not None):
+        raise ValueError(f"--up: expected a model that can use it, found {method.name}")
 
 
 def _made(
