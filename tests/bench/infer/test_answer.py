@@ -85,11 +85,11 @@ def test_answers_that_are_none_are_refused(told, monkeypatch):
     cloud, model = Cloud(points=told.clouds()[0]), told_model(told)
     found = model.predictor.predict(cloud.points)
     bare = replace(found, joints=None)
-    monkeypatch.setattr(Predictor, "predict", lambda *_: bare)
+    monkeypatch.setattr(Predictor, "predict", lambda *_, **__: bare)
     with pytest.raises(InputError, match="a method that predicts poses and joints"):
         ask("a", cloud, model, "fast")
     assert found.camera_T_part is not None
     lost = replace(found, camera_T_part=found.camera_T_part * np.nan)
-    monkeypatch.setattr(Predictor, "predict", lambda *_: lost)
+    monkeypatch.setattr(Predictor, "predict", lambda *_, **__: lost)
     with pytest.raises(InputError, match="an answer in numbers, found NaN"):
         ask("a", cloud, model, "fast")
