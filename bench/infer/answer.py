@@ -59,7 +59,7 @@ def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
         InputError: The method says nothing of joints or part poses.
     """
     drawn = _draw(cloud)
-    found = model.predictor.predict(drawn.points, mode, cloud.sensor, up=cloud.up)
+    found = model.predictor.predict(drawn.points, mode, cloud.sensor, up=_up(cloud, model))
     parts = _parts(name, found, model.category)
     label = np.where(drawn.inlier, _labels(found), BACKGROUND)
     near = KDTree(drawn.points).query(cloud.points)[1]
@@ -84,8 +84,24 @@ def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
         shape=shape,
         evidence=evidence,
         model={"name": model.name, "method": model.method, "sha256": model.digest},
-        warnings=(*cloud.warnings, *_odd_size(cloud, model.category), *words),
+        warnings=(
+            *cloud.warnings,
+            *_odd_size(cloud, model.category),
+            *_unused(cloud, model),
+            *words,
+        ),
     )
+
+
+def _up(cloud: Cloud, model: Model) -> Float[np.ndarray, 3] | None:
+    """The cloud's up, for a model that can use it."""
+    return cloud.up if model.predictor.knows_up else None
+
+
+def _unused(cloud: Cloud, model: Model) -> tuple[str, ...]:
+    """A warning where the model cannot be told the cloud's up."""
+    blind = cloud.up is not None and not model.predictor.knows_up
+    return ("this model cannot use --up",) if blind else ()
 
 
 def agreement(cloud: Cloud, twin: Twin, model: Model, mode: Mode) -> Twin:
@@ -97,7 +113,7 @@ def agreement(cloud: Cloud, twin: Twin, model: Model, mode: Mode) -> Twin:
     count = min(POINTS, max(int(RESAMPLED * len(cloud.points)), LEAST_POINTS // 2))
     draws = [cloud.points[rng.choice(len(cloud.points), count, replace=False)]
              for _ in range(RESAMPLES)]  # fmt: skip
-    found = model.predictor.predict(np.stack(draws), mode, cloud.sensor, up=cloud.up)
+    found = model.predictor.predict(np.stack(draws), mode, cloud.sensor, up=_up(cloud, model))
     others = [_parts(twin.name, _row(found, k), model.category) for k in range(RESAMPLES)]
     poses = np.stack([one.camera_T_part[:, :3, :3] for one in others])
     turn = rotation_degrees(poses, np.broadcast_to(twin.camera_T_part[:, :3, :3], poses.shape))

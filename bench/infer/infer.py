@@ -42,7 +42,7 @@ def infer(request: InferRequest, tell: Callable[[Done], None]) -> list[Done]:
 
     Raises:
         StoreError: No model.
-        UsageError: No inputs, or an up for models that cannot use it.
+        UsageError: No inputs, or an up that no model can use.
         InputError: None that can be read, two of one name, or a scale or place that cannot be.
     """
     require_some("INPUT", request.inputs)
@@ -54,9 +54,9 @@ def infer(request: InferRequest, tell: Callable[[Done], None]) -> list[Done]:
     folders = [request.out / name for name in distinct_names(inputs)]
     device = pick_device(request.device)
     models = load_models(request.checkpoint, request.category, device, request.mode)
-    blind = [model.name for model in models if not model.predictor.knows_up]
-    if request.up is not None and blind:
-        raise UsageError(f"--up: expected models that can use it, found {', '.join(blind)}")
+    if request.up is not None and not any(model.predictor.knows_up for model in models):
+        names = ", ".join(model.name for model in models)
+        raise UsageError(f"--up: expected a model that can use it, found {names}")
     done = []
     for path, folder in zip(inputs, folders, strict=True):
         done.append(_one(path, folder, models, options, request))

@@ -93,3 +93,11 @@ def test_answers_that_are_none_are_refused(told, monkeypatch):
     monkeypatch.setattr(Predictor, "predict", lambda *_, **__: lost)
     with pytest.raises(InputError, match="an answer in numbers, found NaN"):
         ask("a", cloud, model, "fast")
+
+
+def test_a_model_that_cannot_use_the_up_is_asked_without_it_and_says_so(told):
+    cloud, model = Cloud(points=told.clouds()[0]), told_model(told)
+    plain = ask("a", cloud, model, "fast")
+    told_up = ask("a", replace(cloud, up=np.array([0.0, -1, 0])), model, "fast")
+    assert {*told_up.warnings} - {*plain.warnings} == {"this model cannot use --up"}
+    np.testing.assert_allclose(told_up.axis, plain.axis)
