@@ -38,6 +38,8 @@ def restore(archive: Path, out: Path) -> int:
 
 def main() -> None:
     """Unpack all."""
+    if len(sys.argv) < 3:
+        sys.exit(__doc__)
     *archives, out = map(Path, sys.argv[1:])
     for archive in archives:
         print(f"{archive.name}: {restore(archive, out)} files of scores")

@@ -159,7 +159,7 @@ class RegisteredConfig(SearchConfig):
     taken, so that the network alone is trained. None: a template is found."""
     teach: Literal["all", "hinges"] = "all"
     """What of the network learns: all, or nothing but where the hinges of objects sit, which models
-    from before do not know (with `start`; a few epochs of one round)."""
+    that were not told instances do not know (with `start`; a few epochs of one round)."""
     stand: Literal["views", "objects"] = "views"
     """What of the candidates the network learns: the best of each view, or, where it is known which
     clouds show the same object and no symmetry exchanges its parts, those that stand as the object

@@ -17,10 +17,8 @@ from scapo.geometry.rigid import rotation_between
 from scapo.registered.template import ArticulatedTemplate, Placement
 
 LEANING = 1.0
-"""Loss that a hypothesis costs times 1 - cos of what it leans: 0.06 for 20 degrees, which is what
-the losses of right and wrong ones differ by."""
-
-OVER = 20.0  # The same in nats of what a proposal stands like
+"""Loss that a hypothesis costs, times 1 - cos of what it leans: 0.06 for 20 degrees."""
+OVER = 20.0  # Nats by which a proposal stands worse, times the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,7 +4,7 @@
 
     python scripts/experiments/priors.py MODEL DATA [CLOUDS [MODE]]
 
-Asks a released model of the first clouds of `val`, spread over its objects, as it is and without
+Asks a released model of so many clouds of `val`, evenly spread, as it is and without
 one prior at a time, and once told which way is up; the evaluator's means are printed, part order
 per sample, in the object's frame. What a prior is worth in training is another question.
 """
@@ -27,7 +27,7 @@ from scapo.registered import pose_refinement, view_loss
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.pose_search import SearchSpace, light, modes_of
 from scapo.registered.view_bank import ViewBank
-from scapo.registered.view_network import ViewNetwork
+from scapo.registered.views import PartialViews
 
 Change = Callable[[TemplateRegistration], None]
 COLUMNS = {
@@ -65,10 +65,9 @@ def cameras_anywhere(method: TemplateRegistration, space: SearchSpace) -> Search
     return replace(space, rendered=ViewBank.rendered(light(method.template), modes, None))
 
 
-def nothing_seen(*args: object) -> Tensor:
+def nothing_seen(views: PartialViews, points: Tensor, normals: Tensor) -> Tensor:
     """As if no camera would have seen any point of the template."""
-    points = args[1]
-    assert isinstance(points, Tensor)  # noqa: S101 - as `should_be_seen` has it
+    del views, normals
     return torch.zeros(points.shape[:-1], dtype=torch.bool)
 
 
@@ -79,8 +78,7 @@ def without_axes(method: TemplateRegistration) -> None:
 
 def without_hinges(method: TemplateRegistration) -> None:
     """All hinges where the template's are."""
-    assert isinstance(method.network, ViewNetwork)  # noqa: S101 - of every released model
-    method.network.hinged.zero_()
+    method.network.get_buffer("hinged").zero_()
 
 
 CHANGES: dict[str, Change | None] = {
