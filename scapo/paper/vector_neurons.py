@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.first_weights import uniform
-from scapo.geometry.numerics import at_least_float32
+from scapo.geometry.numerics import at_least_float32, exact
 from scapo.geometry.points import farthest_points, gather, k_nearest
 
 EdgeForm = Literal["point", "mean"]
@@ -51,31 +51,9 @@ class Rectify(torch.autograd.Function):
         return to_x, to_d
 
 
-class ScaleToUnit(torch.autograd.Function):
-    """Vectors over the root mean square length of their channel, and that mean square."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ANN401
-        """Input (..., 3, C); the mean square is (C,)."""
-        rows = x.flatten(0, -2)
-        mean_square = 3 * (rows * rows).mean(0)
-        scale = (mean_square + TINY).rsqrt()
-        ctx.save_for_backward(x, scale)
-        ctx.mark_non_differentiable(mean_square)
-        return x * scale, mean_square
-
-    @staticmethod
-    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any,  # noqa: ANN401
-        gradient: Tensor,
-        unused: Tensor,
-    ) -> Tensor:
-        """To x; the mean square has none."""
-        del unused
-        x, scale = ctx.saved_tensors
-        rows = x.shape[:-1].numel()
-        along = (gradient * x).flatten(0, -2).sum(0) * (3 / rows) * scale.pow(3)
-        return (gradient * scale).addcmul_(x, along, value=-1)
+def product(x: Float[Tensor, "*B 3 I"], rows: Float[Tensor, "O I"]) -> Float[Tensor, "*B 3 O"]:
+    """Linear map over the channels, in float32 where autocast multiplies in half precision."""
+    return at_least_float32(F.linear(x, rows))
 
 
 class VNLinear(nn.Module):
@@ -103,11 +81,15 @@ class VNLinear(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B 3 I"]) -> Float[Tensor, "*B 3 O"]:
         """(..., 3, inputs) -> (..., 3, outputs)."""
-        return at_least_float32(F.linear(x, self.rows()))
+        return product(x, self.rows())
 
 
 class VectorScale(nn.Module):
-    """Learned gain over the root mean square length of each channel, running mean for eval."""
+    """Learned gain over the root mean square length of each channel, running mean for eval.
+
+    Lengths are read off the second moments of what comes in, so nothing is multiplied that is as
+    large as the features are: a third of the time of a layer over edges.
+    """
 
     mean_square: Tensor
 
@@ -116,18 +98,23 @@ class VectorScale(nn.Module):
         self.gain = nn.Parameter(torch.ones(channels))
         self.register_buffer("mean_square", torch.ones(channels))
 
-    def forward(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, "*B 3 C"]:
-        """The vectors with a root mean square length of the gain per channel."""
-        if not self.training:
-            return x * (self.gain * (self.mean_square + TINY).rsqrt())
-        out, mean_square = ScaleToUnit.apply(x)
-        with torch.no_grad():
-            self.mean_square.lerp_(mean_square, 0.1)
-        return out * self.gain
+    def forward(
+        self, x: Float[Tensor, "*B 3 I"], rows: Float[Tensor, "O I"]
+    ) -> Float[Tensor, "O I"]:
+        """The rows, so that what they make of x has root mean square lengths of the gain."""
+        mean_square = self.mean_square
+        if self.training:
+            flat = x.flatten(0, -2)
+            with exact(x.device.type):
+                moments = flat.mT @ flat * (3 / len(flat))
+                mean_square = ((rows @ moments) * rows).sum(1).clamp_min(0)
+            with torch.no_grad():
+                self.mean_square.lerp_(mean_square, 0.1)
+        return rows * (self.gain * (mean_square + TINY).rsqrt())[:, None]
 
 
 class VNBatchNorm(nn.Module):
-    """Batch norm of the vectors' lengths; directions stay.
+    """Batch norm of the lengths of a linear map's vectors; directions stay.
 
     `length` is Deng et al.'s: (length - mean) / deviation as the new length. It amplifies relative
     errors about twofold, so a dozen layers leave three digits of float32, and it tears vectors
@@ -141,16 +128,23 @@ class VNBatchNorm(nn.Module):
         self.affine = affine
         self.norm = nn.BatchNorm1d(channels) if form == "length" else VectorScale(channels)
 
-    def forward(self, x: Float[Tensor, "*B 3 C"]) -> Float[Tensor, "*B 3 C"]:
-        """Same shape; equivariant in eval mode, in training mode up to the batch's statistics."""
-        centre = x.mean(-1, keepdim=True) if self.affine else None
-        x = x if centre is None else x - centre
+    def forward(
+        self, x: Float[Tensor, "*B 3 I"], rows: Float[Tensor, "O I"], origin: Tensor | float = 0.0
+    ) -> Float[Tensor, "*B 3 O"]:
+        """Equivariant in eval mode, in training mode up to the batch's statistics.
+
+        Args:
+            x: What the linear map is of.
+            rows: Its matrix.
+            origin: Rows of another map, which is subtracted after the norm.
+        """
+        centre = rows.mean(0, keepdim=True) if self.affine else rows.new_zeros(1)
         if isinstance(self.norm, VectorScale):
-            x = self.norm(x)
-        else:
-            length = (x.square().sum(-2) + TINY).sqrt()  # (..., C)
-            x = x * (self.norm(length.flatten(0, -2)).view_as(length) / length)[..., None, :]
-        return x if centre is None else x + centre
+            return product(x, self.norm(x, rows - centre) + centre - origin)
+        about = product(x, rows - centre)
+        length = (about.square().sum(-2) + TINY).sqrt()  # (..., O)
+        gain = (self.norm(length.flatten(0, -2)).view_as(length) / length)[..., None, :]
+        return about * gain + (product(x, centre - origin) if self.affine else 0.0)
 
 
 def rectify(
@@ -177,11 +171,12 @@ class VNBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B 3 I"]) -> Float[Tensor, "*B 3 O"]:
         """(..., 3, inputs) -> (..., 3, outputs)."""
-        feature, direction = self.norm(self.feature(x)), self.direction(x)
+        rows, direction = self.feature.rows(), self.direction.rows()
         if self.origin is None:
-            return rectify(feature, direction)
-        origin = self.origin(x)
-        return rectify(feature - origin, direction - origin) + origin
+            return rectify(self.norm(x, rows), product(x, direction))
+        origin = self.origin.rows()
+        relative = rectify(self.norm(x, rows, origin), product(x, direction - origin))
+        return relative + product(x, origin)
 
 
 @torch.no_grad()

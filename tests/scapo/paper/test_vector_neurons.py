@@ -63,14 +63,16 @@ def test_rectify_removes_only_what_points_backwards() -> None:
 def test_the_scale_norm_makes_lengths_one() -> None:
     norm = vn.VNBatchNorm(3).double()
     x = 7 * normal(1, 500, 3, 3)
-    out = [norm(x) for _ in range(200)][-1]
-    assert_close(out.square().sum(-2).mean(0), torch.ones(3, dtype=torch.float64))
-    assert_close(norm.eval()(x), out, atol=1e-6, rtol=1e-6)
+    rows = normal(2, 3, 3)
+    out = [norm(x, rows) for _ in range(200)][-1]
+    wanted = x @ rows.mT
+    assert_close(out, wanted / wanted.square().sum(-2).mean(0).sqrt())
+    assert_close(norm.eval()(x, rows), out, atol=1e-6, rtol=1e-6)
 
 
 def test_the_length_norm_is_batch_norm_of_the_lengths() -> None:
     x = normal(2, 50, 3, 3)
-    out = vn.VNBatchNorm(3, form="length").double()(x)
+    out = vn.VNBatchNorm(3, form="length").double()(x, torch.eye(3, dtype=torch.float64))
     length = x.norm(dim=-2)
     wanted = (length - length.mean(0)) / (length.var(0, unbiased=False) + 1e-5).sqrt()
     assert_close((out * x).sum(-2) / length, wanted, atol=1e-9, rtol=1e-9)
@@ -131,6 +133,26 @@ def test_centres_of_a_cloud_with_few_different_points() -> None:
 def test_gradients_by_hand_are_the_numerical_ones() -> None:
     x, d = normal(1, 4, 3, 5).requires_grad_(), normal(2, 4, 3, 5).requires_grad_()
     assert torch.autograd.gradcheck(vn.rectify, (x, d))
-    assert torch.autograd.gradcheck(lambda x: vn.ScaleToUnit.apply(x)[0], (x,))
-    wanted = x / (3 * x.square().mean((0, 1))).sqrt()
-    assert_close(vn.ScaleToUnit.apply(x)[0], wanted)
+
+
+@pytest.mark.parametrize("affine", [False, True])
+@pytest.mark.parametrize("form", ["scale", "length"])
+def test_a_block_in_training_is_its_formula(form: vn.NormForm, affine: bool) -> None:
+    block = made(vn.VNBlock(CHANNELS, 7, affine=affine, norm=form), 3).train()
+    x = normal(4, 50, 3, CHANNELS).requires_grad_()
+    feature, direction = block.feature(x), block.direction(x)
+    centre = feature.mean(-1, keepdim=True) if affine else 0
+    about = feature - centre
+    length = about.norm(dim=-2)
+    if form == "scale":
+        scale = block.norm.norm.gain / length.square().mean(0).sqrt()
+    else:
+        spread = (length - length.mean(0)) / (length.var(0, unbiased=False) + 1e-5).sqrt()
+        scale = (spread * block.norm.norm.weight + block.norm.norm.bias) / length
+    feature = about * scale[..., None, :] + centre
+    origin = block.origin(x) if block.origin is not None else 0
+    wanted = vn.rectify(feature - origin, direction - origin) + origin
+    assert_close(block(x), wanted, atol=1e-9, rtol=1e-9)
+    of = [x, *block.parameters()]
+    found, expected = (torch.autograd.grad(out.square().sum(), of) for out in (block(x), wanted))
+    assert_close(found, expected, atol=1e-7, rtol=1e-7)
