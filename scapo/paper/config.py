@@ -125,7 +125,7 @@ def complete_config() -> ScapoConfig:
         lean,
         preset="complete",
         points=512,
-        encoder=replace(lean.encoder, centres=48, neighbours=10, branch=(32, 64, 48, 32)),
+        encoder=replace(lean.encoder, centres=48, neighbours=40, branch=(32, 64, 48, 32)),
         decoder=replace(lean.decoder, points=256),
         joint=replace(lean.joint, width=32, points=192, base_fixed=False, revolute_range=4.0),
         loss=replace(

@@ -170,15 +170,15 @@ class Scapo(AbstractMethod):
             ValueError: None was named.
         """
         del labels
-        config = self.config
+        config, number = self.config, observation.points.shape[0]
+        told_of = evenly(number, config.told).to(generator.device)
         if config.part_start == "run":
-            self._warm()
+            self._warm().ask(observation, told_of, generator, self.journal)
         if stage != ARTICULATE or config.template_start == "random":
             return
-        number = observation.points.shape[0]
         chosen = torch.randperm(number, generator=generator, device=generator.device)[:2000]
         if config.part_start == "run":
-            chosen = evenly(number, config.told).to(chosen)
+            chosen = told_of
         self.eval()
         clouds = normalise(observation.points[chosen])[0]
         count = config.points or clouds.shape[1]

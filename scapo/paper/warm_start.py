@@ -11,8 +11,10 @@ Frame `base`: that of the base part, the aligned frame of a network that errs no
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -21,7 +23,7 @@ from torch import Tensor
 
 from scapo.geometry.points import chamfer, fibonacci_sphere, normalise
 from scapo.geometry.rigid import apply, invert, joint_motion, rigid
-from scapo.method import AbstractMethod, Mode
+from scapo.method import NO_JOURNAL, AbstractMethod, Journal, Mode
 from scapo.paper import losses
 from scapo.paper.autoencoder import Encoding
 from scapo.paper.first_targets import Lying
@@ -32,6 +34,10 @@ from scapo.types import Observation
 
 POINTS = 1024
 """Of a shape that are learned from: the first, which `registered` leaves spread out."""
+LOT = 32
+"""Clouds that are asked about at a time."""
+USUAL: dict[Mode, float] = {"fast": 0.04, "quick": 0.06, "refine": 0.3, "whole": 0.3}
+"""Seconds of one core that a cloud takes, before it is known better."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -233,6 +239,35 @@ class WarmStart:
         self.two_readings = method.category.symmetry is not None and hinges
         self.exchange: Exchange | None = None
 
+    def ask(
+        self,
+        observation: Observation,
+        index: Int[Tensor, " B"],
+        generator: torch.Generator,
+        journal: Journal = NO_JOURNAL,
+    ) -> None:
+        """Ask about many clouds before a training begins.
+
+        Args:
+            observation: All training clouds.
+            index: Rows of those to be asked about; what is known of them is not asked again.
+            generator: Of the training; nothing is drawn.
+            journal: Told how far it is; keeps the answers until the start is over.
+        """
+        new = [k for k, row in enumerate(index.tolist()) if row not in self.known]
+        lots = index[new].split(LOT) if new else ()
+        clouds = (map_tensors(take(observation, lot), Tensor.cpu) for lot in lots)
+        jobs = journal.ahead([partial(self._ask, some) for some in clouds])
+        began = time.monotonic()
+        for number, (lot, job) in enumerate(zip(lots, jobs, strict=True)):
+            pace = (time.monotonic() - began) / number if number else LOT * USUAL[self.mode]
+            journal.tell("asked about clouds", number / len(lots), pace * (len(lots) - number))
+            found = journal.once(f"told {number}", job, generator, {Told.__name__: Told})
+            self._keep(lot, found)
+
+    def _keep(self, index: Int[Tensor, " B"], told: Told) -> None:
+        self.known |= {row: take(told, torch.tensor([i])) for i, row in enumerate(index.tolist())}
+
     def read(
         self,
         observation: Observation,
@@ -269,8 +304,7 @@ class WarmStart:
         new = [k for k, row in enumerate(rows) if row not in self.known]
         if new:
             some = map_tensors(take(observation, torch.tensor(new).to(index)), Tensor.cpu)
-            found = self._ask(some)
-            self.known |= {rows[k]: take(found, torch.tensor([i])) for i, k in enumerate(new)}
+            self._keep(index[new], self._ask(some))
         every = cat([self.known[row] for row in rows])
         return map_tensors(every, lambda tensor: tensor.to(observation.points.device))
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +17,7 @@ from scapo.geometry.points import nearest, normalise
 from scapo.geometry.rigid import apply, rigid
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import Mode, Step, evenly
+from scapo.paper import warm_start
 from scapo.paper.autoencoder import Encoding
 from scapo.paper.config import warm_config
 from scapo.paper.first_targets import first_targets
@@ -25,6 +26,7 @@ from scapo.paper.skinning import cross_maps, deform, part_maps
 from scapo.paper.warm_start import Exchange, Told, WarmStart, imitation
 from scapo.registered.method import load_run
 from scapo.store.schema import StoreError
+from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.placed import Told as Oracle
 from tests.helpers.placed import placed_run
@@ -204,14 +206,46 @@ def test_two_readings_are_asked_for_where_parts_may_change_places(category: str,
     assert WarmStart(method).two_readings == two
 
 
+class Counted(Oracle):
+    asked: int = 0
+    last: float = float("inf")
+    """Of the clouds, where it is interrupted."""
+
+    def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
+        if self.asked >= self.last:
+            raise KeyboardInterrupt
+        self.asked += len(observation.points)
+        return super().predict(observation, mode)
+
+
+def test_asking_goes_on_where_it_was_interrupted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(warm_start, "LOT", 4)
+    method, told = Counted(10), list[float]()
+    observation = Observation(points=torch.as_tensor(method.clouds()))
+
+    def begun() -> WarmStart:
+        start = WarmStart(method)
+        journal = StoredJournal(tmp_path, {"seed": 1}, CANONICALISE, lambda *at: told.append(at[1]))
+        start.ask(observation, evenly(10, 9), generator(1), journal)
+        return start
+
+    method.last = 8
+    with pytest.raises(KeyboardInterrupt):
+        begun()
+    method.last = float("inf")
+    start = begun()
+    assert method.asked == 9
+    assert told == pytest.approx([0, 1 / 3, 2 / 3] * 2)
+    index = evenly(10, 9)
+    some = Observation(points=observation.points[index])
+    found = start.of(some, index)
+    assert method.asked == 9
+    assert_close(asdict(found), asdict(WarmStart(method).of(some, index)), atol=1e-5, rtol=0)
+
+
 def test_each_cloud_is_asked_about_once() -> None:
-    class Counted(Oracle):
-        asked: int = 0
-
-        def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
-            self.asked += len(observation.points)
-            return super().predict(observation, mode)
-
     method = Counted(10)
     observation = Observation(points=torch.as_tensor(method.clouds()))
     start = WarmStart(method)
@@ -292,8 +326,9 @@ def test_the_run_is_read_from_disk_and_is_no_part_of_the_model(run: Path) -> Non
 
 @pytest.mark.parametrize(("told_of", "mode"), [("views", "quick"), ("surfaces", "whole")])
 def test_a_run_is_asked_about_what_the_clouds_show(
-    run: Path, told_of: Literal["views", "surfaces"], mode: Mode
+    run: Path, told_of: Literal["views", "surfaces"], mode: Mode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(WarmStart, "ask", lambda *_: None)  # the run's network is untaught
     config = replace(WARM, start=str(run), told_of=told_of)
     model = Scapo(config, CATEGORIES["oven"], generator(0))
     model.start(CANONICALISE, oracle()[1], Labels(), generator(1))
