@@ -9,6 +9,7 @@ them, in the aligned frame of the encoder, and the networks are fitted to it. No
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 from scapo.categories import JointKind
 from scapo.geometry.rigid import apply, joint_motion, rotation_between
 from scapo.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from scapo.method import NO_JOURNAL, Journal
 from scapo.paper.heads import JointNetwork, JointPairs, KeypointNetwork, ResidualNetwork
 from scapo.paper.part_search import Placements, Skeleton
 
@@ -145,6 +147,7 @@ def fit_networks(
     wanted: FirstTargets,
     generator: torch.Generator,
     steps: int,
+    journal: Journal = NO_JOURNAL,
 ) -> list[float]:
     """Fit the three networks to the targets; the mean loss of every 50 steps.
 
@@ -154,13 +157,18 @@ def fit_networks(
         wanted: Of the same clouds.
         generator: Chooses batches and points.
         steps: Of Adam, 32 clouds each, the rate on half a cosine from RATE.
+        journal: Told how far it is.
     """
     joints, keypoints, residual = networks
     parameters = trainable(networks)
     optimizer = torch.optim.Adam(parameters, lr=RATE)
     count, number = inputs.aligned.shape[:2]
     history: list[float] = []
+    began = time.monotonic()
     for k in range(steps):
+        if k % 50 == 1:
+            left = (time.monotonic() - began) / k * (steps - k)
+            journal.tell("networks fitted to it", k / steps, left)
         index = torch.randint(count, (32,), generator=generator, device=generator.device)
         order = torch.randperm(number, generator=generator, device=generator.device)
         want = wanted.rows(index)

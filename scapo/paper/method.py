@@ -253,6 +253,7 @@ class Scapo(AbstractMethod):
             first_targets(skeleton.points, own, self.kinds),
             generator,
             self.config.search.teaching,
+            self.journal,
         )
 
     def _decoded(

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 from scapo.categories import CATEGORIES, JointKind
 from scapo.first_weights import initialise
 from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.method import Journal
 from scapo.paper.first_targets import Inputs, first_targets, fit_networks, lying
 from scapo.paper.heads import JointNetwork, KeypointNetwork, ResidualNetwork
 from scapo.paper.part_search import Placements, Skeleton, T, having, posed, values
@@ -103,6 +104,15 @@ def test_networks_learn_the_targets() -> None:
         code=torch.randn(8, 6, generator=generator(1)),
         features=torch.randn(8, 40, 8, generator=generator(2)),
     )
-    history = fit_networks(networks, inputs, wanted, generator(3), 100)
+    told = list[tuple[float, float]]()
+
+    class Listening(Journal):
+        def tell(self, words: str, done: float, left: float) -> None:
+            del words
+            told.append((done, left))
+
+    history = fit_networks(networks, inputs, wanted, generator(3), 100, Listening())
+    assert [done for done, _ in told] == [0.01, 0.51]
+    assert all(left > 0 for _, left in told)
     assert len(history) == 2
     assert history[-1] < 0.8 * history[0]
