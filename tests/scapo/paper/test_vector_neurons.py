@@ -138,17 +138,19 @@ def test_gradients_by_hand_are_the_numerical_ones() -> None:
 @pytest.mark.parametrize("affine", [False, True])
 @pytest.mark.parametrize("form", ["scale", "length"])
 def test_a_block_in_training_is_its_formula(form: vn.NormForm, affine: bool) -> None:
-    block = made(vn.VNBlock(CHANNELS, 7, affine=affine, norm=form), 3).train()
+    block = vn.VNBlock(CHANNELS, 7, affine=affine, norm=form)
+    made(block, 3).train()
     x = normal(4, 50, 3, CHANNELS).requires_grad_()
     feature, direction = block.feature(x), block.direction(x)
     centre = feature.mean(-1, keepdim=True) if affine else 0
     about = feature - centre
     length = about.norm(dim=-2)
-    if form == "scale":
-        scale = block.norm.norm.gain / length.square().mean(0).sqrt()
+    norm = block.norm.norm
+    if isinstance(norm, vn.VectorScale):
+        scale = norm.gain / length.square().mean(0).sqrt()
     else:
         spread = (length - length.mean(0)) / (length.var(0, unbiased=False) + 1e-5).sqrt()
-        scale = (spread * block.norm.norm.weight + block.norm.norm.bias) / length
+        scale = (spread * norm.weight + norm.bias) / length
     feature = about * scale[..., None, :] + centre
     origin = block.origin(x) if block.origin is not None else 0
     wanted = vn.rectify(feature - origin, direction - origin) + origin
