@@ -70,11 +70,15 @@ def check_calibration(path: Path, header: Header, tested: Header) -> None:
     Raises:
         StoreError: Of the split that is scored, or of another method, variant, seed or category.
     """
-    if header.data_digest == tested.data_digest or header.split != CALIBRATION_SPLIT:
+    if header.split != CALIBRATION_SPLIT:
         raise StoreError(
-            f"{path}: expected predictions on the split {CALIBRATION_SPLIT!r} for "
-            f"calibration, found split {header.split!r} with data digest "
-            f"{header.data_digest!r}"
+            f"{path}: expected predictions on the split {CALIBRATION_SPLIT!r} for calibration, "
+            f"found split {header.split!r}"
+        )
+    if header.data_digest == tested.data_digest:
+        raise StoreError(
+            f"{path}: expected for calibration other clouds than those that are scored, found the "
+            f"same data (digest {header.data_digest})"
         )
     for name in ("method", "variant", "seed", "category"):
         want, have = getattr(tested, name), getattr(header, name)

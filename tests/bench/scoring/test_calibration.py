@@ -137,7 +137,7 @@ def test_calibration_on_tested_or_foreign_predictions_is_refused(laptop, tmp_pat
     sly = tmp_path / "sly.safetensors"
     write_predictions(sly, made.header_of(laptop, split="train"),
                       made.truth_as_prediction(laptop))  # fmt: skip
-    with pytest.raises(StoreError, match="for calibration, found split 'train' with data digest"):
+    with pytest.raises(StoreError, match="other clouds than those that are scored"):
         evaluate(dataclasses.replace(request, calibration=sly))
     for field, value in (("method", "other"), ("variant", "v2"), ("seed", 2)):
         other = made.write_truth(tmp_path / "o.safetensors", train, **{field: value})
