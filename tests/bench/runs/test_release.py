@@ -186,6 +186,6 @@ def test_what_is_released_here_answers_as_it_did(name: str):
     assert answers_file(path).is_file()
     found = compare_answers(path)
     assert float(found["fast"].pose.max()) < 1e-3
-    assert float(found["fast"].part_weight.max()) < 1e-3
+    assert float(found["fast"].part_weight.max()) < 0.05  # of a point between two parts
     # A search may end elsewhere where two placements fit alike and a machine rounds otherwise.
     assert (found["quick"].pose < 1e-2).sum() >= 8

@@ -96,7 +96,7 @@ def test_scapo_without_noise_has_closely_the_same_curve(folder: Path, tmp_path: 
     """Batch norm sees half a batch on each rank, which is all the difference."""
     fit.fit(still(), tiny_data(), tmp_path, CONFIG)
     one, two = curve(tmp_path)[:, 1], curve(folder / "still")[:, 1]
-    assert one[-1] < 0.8 * one[0]
+    assert one[-1] < 0.85 * one[0]
     np.testing.assert_allclose(two, one, rtol=0.15)
 
 
