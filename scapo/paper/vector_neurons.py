@@ -88,7 +88,7 @@ class VectorScale(nn.Module):
     """Learned gain over the root mean square length of each channel, running mean for eval.
 
     Lengths are read off the second moments of what comes in, so nothing is multiplied that is as
-    large as the features are: a third of the time of a layer over edges.
+    large as the features are.
     """
 
     mean_square: Tensor
