@@ -171,14 +171,14 @@ class Scapo(AbstractMethod):
         """
         del labels
         config, number = self.config, observation.points.shape[0]
-        told_of = evenly(number, config.told).to(generator.device)
+        asked = evenly(number, config.told).to(generator.device)
         if config.part_start == "run":
-            self._warm().ask(observation, told_of, generator, self.journal)
+            self._warm().ask(observation, asked, generator, self.journal)
         if stage != ARTICULATE or config.template_start == "random":
             return
         chosen = torch.randperm(number, generator=generator, device=generator.device)[:2000]
         if config.part_start == "run":
-            chosen = told_of
+            chosen = asked
         self.eval()
         clouds = normalise(observation.points[chosen])[0]
         count = config.points or clouds.shape[1]
@@ -217,6 +217,7 @@ class Scapo(AbstractMethod):
                     f"supervision: expected what {self.config.start} was told, {hidden}, "
                     f"found it left out; add --supervision {hidden}"
                 )
+            run.strip()  # it goes to the workers with every lot of clouds
             self._run = WarmStart(run, "whole" if self.config.told_of == "surfaces" else "quick")
         return self._run
 

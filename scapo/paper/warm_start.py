@@ -34,7 +34,7 @@ from scapo.types import Observation
 
 POINTS = 1024
 """Of a shape that are learned from: the first, which `registered` leaves spread out."""
-LOT = 32
+LOT = 100
 """Clouds that are asked about at a time."""
 USUAL: dict[Mode, float] = {"fast": 0.04, "quick": 0.06, "refine": 0.3, "whole": 0.3}
 """Seconds of one core that a cloud takes, before it is known better."""

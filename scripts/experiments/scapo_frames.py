@@ -5,15 +5,19 @@ The first stage of preset `warm` with its encoder alone, on 1,500 clouds of `tra
 clouds of `val` every 250 steps. Labels enter the fit: a diagnosis, no method.
 
     python scripts/experiments/scapo_frames.py DATA/complete oven 500 neighbours=40 centres=48
+
+Beside what `EncoderConfig` has: points=N of a cloud, batch=N, lr=RATE.
 """
 
 from __future__ import annotations
 
+import ast
 import math
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +33,7 @@ from scapo.paper.config import warm_config
 from scapo.paper.heads import thin
 from scapo.store.samples import read_training_data
 
-BATCH, CLOUDS, UNSEEN, EVERY = 32, 1500, 300, 250
+CLOUDS, UNSEEN, EVERY = 1500, 300, 250
 
 
 def placed(data: Path, category: str, split: str, count: int) -> tuple[Tensor, Tensor]:
@@ -44,21 +48,30 @@ def placed(data: Path, category: str, split: str, count: int) -> tuple[Tensor, T
     return clouds, rigid(pose[:, :3, :3], at)
 
 
-def main(data: Path, category: str, steps: int, sizes: dict[str, int]) -> None:
+def value(text: str) -> object:
+    """A number, several of them, or a word."""
+    try:
+        return ast.literal_eval(text)
+    except ValueError:
+        return text
+
+
+def main(data: Path, category: str, steps: int, sizes: dict[str, Any]) -> None:
     """Train, and print the errors of frames that were not seen."""
     preset, generator = warm_config(), torch.Generator().manual_seed(1)
+    batch, rate = sizes.pop("batch", preset.batch), sizes.pop("lr", preset.lr[0])
+    count = sizes.pop("points", preset.points)
     network = Encoder(replace(preset.encoder, **sizes))
     initialise(network, generator)
     clouds, pose = placed(data, category, "train", CLOUDS)
     unseen, true = placed(data, category, "val", UNSEEN)
-    count = preset.points or clouds.shape[1]
-    optimiser = torch.optim.Adam(network.parameters(), preset.lr[0])
+    optimiser = torch.optim.Adam(network.parameters(), rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, preset.min_lr)
     began, terms = time.monotonic(), list[float]()
     for step in range(1, steps + 1):
-        drawn = torch.randint(CLOUDS, (BATCH,), generator=generator)
+        drawn = torch.randint(CLOUDS, (batch,), generator=generator)
         some = torch.randperm(clouds.shape[1], generator=generator)[:count]
-        move = random_pose(BATCH, preset.loss.shift, generator, clouds)
+        move = random_pose(batch, preset.loss.shift, generator, clouds)
         said, wanted = network(apply(move, clouds[drawn][:, some])), move @ pose[drawn]
         frame = losses.pose_agreement(
             said.rotation, said.translation, wanted[:, :3, :3], wanted[:, :3, 3]
@@ -89,5 +102,5 @@ if __name__ == "__main__":
         Path(sys.argv[1]),
         sys.argv[2],
         int(sys.argv[3]),
-        {name: int(value) for name, value in (word.split("=") for word in sys.argv[4:])},
+        {name: value(text) for name, text in (word.split("=") for word in sys.argv[4:])},
     )
