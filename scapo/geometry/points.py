@@ -64,6 +64,33 @@ def k_nearest_by_tree(
     return torch.from_numpy(np.asarray(index, np.int64).reshape(-1, k))
 
 
+NEIGHBOURS = 12
+"""Points of a template that tell the part of an observed one."""
+REACH = 0.04
+"""Of their weights, normalised length."""
+
+
+@torch.no_grad()
+def smoothed(
+    source: Float[Tensor, "N D"], target: Float[Tensor, "M D"], values: Float[Tensor, "M P"]
+) -> Float[Tensor, "N P"]:
+    """Mean of the values at the nearest targets, a Gaussian of `REACH` beyond the nearest.
+
+    The labels of single template points are noisy where two parts meet, and wrong where a point of
+    one part lies a little nearer to a sparse surface of another.
+
+    Args:
+        source: Normalised positions, or positions and normals (`oriented`).
+        target: The same of the points that have values.
+        values: Such as weights of parts.
+    """
+    index = k_nearest_by_tree(source, target, min(NEIGHBOURS, len(target)))
+    off = (source[:, None] - target[index]).square().sum(-1)
+    share = torch.exp((off[:, :1] - off) / (2 * REACH**2))
+    share = share / share.sum(-1, keepdim=True)
+    return (share[..., None] * values[index]).sum(1)
+
+
 @uncompiled  # blocks, numpy and exact arithmetic are no matter for a compiler
 def _search(
     source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"], k: int

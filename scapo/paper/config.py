@@ -51,8 +51,8 @@ class ScapoConfig:
     """V of a bone turns with its part (BANMo); otherwise it is the same in every state."""
     labels_of: Literal["skinning", "template", "told"] = "skinning"
     """Whose weights a prediction gives: w of the bones on S_obj; those of the nearest point of the
-    posed template, which ends at the hinge where two Gaussians do not; or the part of which that
-    point was where stage 2 began, since no Gaussian is a door in front of its body."""
+    posed template, which ends at the hinge where two Gaussians do not; or the parts of which the
+    nearest dozen were where stage 2 began, since no Gaussian is a door in front of its body."""
     encoder_in_stage_2: Literal["joint", "frozen", "end-to-end"] = "joint"
     """joint: frozen for the first half, then a tenth of the rate; end-to-end: all of it."""
     supervision: tuple[Literal["segmentation", "joint", "instance"], ...] = ()

@@ -43,7 +43,7 @@ from scapo.paper.heads import (
 )
 from scapo.paper.objectives import Explanation, articulation, canonicalisation
 from scapo.paper.part_search import PartSearch, Skeleton, motionless
-from scapo.paper.refine import nearest_template_weights, refine
+from scapo.paper.refine import nearest_template_weights, refine, smoothed_template_weights
 from scapo.paper.skinning import Bones, cross_maps, part_maps
 from scapo.paper.warm_start import WarmStart, imitation
 from scapo.pictures import PictureData
@@ -353,17 +353,24 @@ class Scapo(AbstractMethod):
             return canonical_pictures(explanation, shape)
         return articulated_pictures(explanation, self.bones, self.kinds)
 
+    def _as_told(self, e: Explanation) -> Explanation:
+        """With the parts that the template's points were told in place of the bones' weights."""
+        told = F.one_hot(self.template.part.long(), len(self.category.parts)).to(e.aligned)
+        return replace(e, template_weights=told.expand_as(e.template_weights))
+
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Weights on S_obj, joints by (R_g, t_g), part poses global o T_{Y->X} (docs/method.md).
 
         The part frames are the template's: every part's pose carries the template onto the
         cloud. States are those of the cloud minus the template's. `refine` moves pose and joints
-        of each cloud until the posed template fits it, `labels_of` takes the template's weights
-        or parts (neither in the paper).
+        of each cloud until the posed template, told parts as hard ones, fits it; `labels_of` takes
+        the template's weights or parts (neither in the paper).
         """
         points, similarity = normalise(observation.points)
         explanation = self.explain(points)
+        if self.config.labels_of == "told":
+            explanation = self._as_told(explanation)
         if mode == "refine":
             explanation = refine(points, explanation, self.kinds)
         encoding, joints = explanation.encoding, explanation.joints
@@ -373,11 +380,8 @@ class Scapo(AbstractMethod):
         slide = torch.tensor([kind == "prismatic" for kind in self.kinds], device=state.device)
         scale, weights = similarity.scale[:, None], explanation.weights
         if self.config.labels_of == "told":
-            told = F.one_hot(self.template.part.long(), len(self.category.parts)).to(points)
-            explanation = replace(
-                explanation, template_weights=told.expand_as(explanation.template_weights)
-            )
-        if self.config.labels_of != "skinning":
+            weights = smoothed_template_weights(points, explanation, self.kinds)
+        elif self.config.labels_of == "template":
             weights = nearest_template_weights(points, explanation, self.kinds)
         return Prediction(
             part_weight=weights,

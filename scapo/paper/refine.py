@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import gather, nearest, squared_distances
+from scapo.geometry.points import gather, nearest, smoothed, squared_distances
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation
@@ -46,6 +46,20 @@ def nearest_template_weights(
         kinds: Of the joints.
     """
     return gather(e.template_weights, nearest(points, posed_template(e, kinds)))
+
+
+def smoothed_template_weights(
+    points: Float[Tensor, "B N 3"], e: Explanation, kinds: tuple[JointKind, ...]
+) -> Float[Tensor, "B N P"]:
+    """The same of several nearest points: where parts are hard, one alone is often the wrong one.
+
+    Args:
+        points: Input frame.
+        e: What the networks say of them.
+        kinds: Of the joints.
+    """
+    clouds = zip(points, posed_template(e, kinds), e.template_weights, strict=True)
+    return torch.stack([smoothed(*cloud) for cloud in clouds])
 
 
 def misfit(

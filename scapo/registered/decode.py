@@ -10,14 +10,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.geometry.points import Similarity, k_nearest_by_tree
+from scapo.geometry.points import Similarity, smoothed
 from scapo.geometry.rigid import rigid
 from scapo.registered.joint_limits import JointLimits
 from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
 from scapo.types import Joints, Prediction
-
-NEIGHBOURS = 12  # Template points that tell the part of an observed one
-REACH = 0.04  # Of their weights, normalised length; normals count as in `oriented`
 
 
 @torch.no_grad()
@@ -132,17 +129,3 @@ def nearest_weights(
     return torch.stack(
         [smoothed(one, other, weight) for one, other in zip(source, target, strict=True)]
     )
-
-
-def smoothed(
-    source: Float[Tensor, "N D"], target: Float[Tensor, "M D"], values: Float[Tensor, "M P"]
-) -> Float[Tensor, "N P"]:
-    """Mean of the values at the nearest targets, a Gaussian of `REACH` beyond the nearest.
-
-    The labels of single template points are noisy where two parts meet.
-    """
-    index = k_nearest_by_tree(source, target, min(NEIGHBOURS, len(target)))
-    off = (source[:, None] - target[index]).square().sum(-1)
-    share = torch.exp((off[:, :1] - off) / (2 * REACH**2))
-    share = share / share.sum(-1, keepdim=True)
-    return (share[..., None] * values[index]).sum(1)

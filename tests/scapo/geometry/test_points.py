@@ -249,3 +249,21 @@ def test_k_means_are_scipys_and_a_centre_without_points_stays():
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
     far = torch.full((1, 3), 100.0, dtype=points.dtype)
     assert torch.equal(cloud.k_means(points, torch.cat([points[:4], far]), 6)[4:], far)
+
+
+def test_single_wrong_labels_are_outvoted() -> None:
+    g = torch.Generator().manual_seed(3)
+    target, source = torch.rand(1600, 2, generator=g), torch.rand(2000, 2, generator=g)
+    wrong = torch.rand(1600, generator=g) < 0.1
+    label = ((target[:, 0] >= 0.5) ^ wrong).long()
+    found = cloud.smoothed(source, target, torch.nn.functional.one_hot(label, 2).float())
+    assert_close(found.sum(-1), torch.ones(2000), atol=1e-5, rtol=0)
+    truth = (source[:, 0] >= 0.5).long()
+    single = label[torch.cdist(source, target).argmin(1)]
+    assert (single != truth).float().mean() > 0.08
+    assert (found.argmax(-1) != truth).float().mean() < 0.03
+
+
+def test_what_lies_on_a_target_far_from_others_is_its_own() -> None:
+    target = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
+    assert_close(cloud.smoothed(target, target, torch.eye(3)), torch.eye(3), atol=1e-6, rtol=0)

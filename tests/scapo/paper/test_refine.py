@@ -8,11 +8,20 @@ from dataclasses import replace
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.categories import JointKind
 from scapo.geometry.points import normalise
-from scapo.paper.refine import misfit, moved, posed_template, refine
+from scapo.paper.method import Scapo
+from scapo.paper.objectives import Explanation
+from scapo.paper.refine import (
+    misfit,
+    moved,
+    posed_template,
+    refine,
+    smoothed_template_weights,
+)
 from scapo.types import Observation
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import normal
@@ -85,18 +94,37 @@ def test_labels_of_the_template_are_those_of_its_nearest_point() -> None:
     assert not torch.equal(found, e.weights)
 
 
-def test_parts_that_were_told_are_those_of_the_nearest_point_as_they_pose_it() -> None:
-    """Whatever the bones say: a template of which the parts are told the other way round."""
+def told_otherwise(seed: int) -> tuple[Scapo, Tensor, Explanation]:
+    """A model, normalised clouds, and what it says of them if parts are told the other way round.
+
+    Whatever the bones say.
+    """
     model = tiny(config=replace(TINY, labels_of="told")).eval()
-    points = plates(3, 96)[0].points
+    cloud, _ = normalise(plates(seed, 96)[0].points)
     with torch.no_grad():
-        cloud, _ = normalise(points)
         e = model.explain(cloud)
         model.template.part.copy_(e.template_weights[0].argmin(-1))
         told = F.one_hot(model.template.part.long(), 2).to(cloud).expand_as(e.template_weights)
-        posed = posed_template(replace(e, template_weights=told), model.kinds)
-    found = model.predict(Observation(points=points))
-    index = torch.cdist(cloud, posed).argmin(-1)
-    assert torch.equal(found.part_weight.argmax(-1), model.template.part.long()[index])
+    return model, cloud, replace(e, template_weights=told)
+
+
+@torch.no_grad()
+def test_parts_that_were_told_are_those_of_the_points_around_as_they_pose_them() -> None:
+    model, cloud, e = told_otherwise(3)
+    found = model.predict(Observation(points=plates(3, 96)[0].points))
+    off, index = torch.cdist(cloud, posed_template(e, model.kinds)).topk(12, largest=False)
+    share = torch.exp(-off.square() / (2 * 0.04**2))
+    expected = (share[..., None] * e.template_weights[0][index]).sum(2) / share.sum(2)[..., None]
+    assert_close(found.part_weight, expected, atol=1e-4, rtol=0)
     assert found.canonical_part is not None
     assert torch.equal(found.canonical_part[0], model.template.part.long())
+
+
+@torch.no_grad()
+def test_told_parts_are_what_refinement_moves() -> None:
+    model, cloud, e = told_otherwise(3)
+    found = model.predict(Observation(points=plates(3, 96)[0].points), "refine")
+    fitted = refine(cloud, e, model.kinds)
+    assert misfit(cloud, fitted, model.kinds).mean() <= misfit(cloud, e, model.kinds).mean()
+    weights = smoothed_template_weights(cloud, fitted, model.kinds)
+    assert_close(found.part_weight, weights, atol=1e-5, rtol=0)

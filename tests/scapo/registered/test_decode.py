@@ -16,7 +16,6 @@ from scapo.registered.decode import (
     metric_limits,
     nearest_weights,
     placed_prediction,
-    smoothed,
 )
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.template import ArticulatedTemplate, Placement
@@ -87,24 +86,6 @@ def test_weights_come_from_the_part_that_is_there():
     fine = nearest_weights(template(seed=9, count=3000), views.points, normals, truth)
     assert (weight.argmax(-1) == fine.argmax(-1)).float().mean() > 0.95
     assert_close(weight.sum(-1), torch.ones(2, views.points.shape[1]), atol=1e-5, rtol=0)
-
-
-def test_single_wrong_labels_are_outvoted():
-    g = generator(3)
-    target, source = torch.rand(1600, 2, generator=g), torch.rand(2000, 2, generator=g)
-    wrong = torch.rand(1600, generator=g) < 0.1
-    label = ((target[:, 0] >= 0.5) ^ wrong).long()
-    found = smoothed(source, target, torch.nn.functional.one_hot(label, 2).float())
-    assert_close(found.sum(-1), torch.ones(2000), atol=1e-5, rtol=0)
-    truth = (source[:, 0] >= 0.5).long()
-    single = label[torch.cdist(source, target).argmin(1)]
-    assert (single != truth).float().mean() > 0.08
-    assert (found.argmax(-1) != truth).float().mean() < 0.03
-
-
-def test_what_lies_on_a_target_far_from_others_is_its_own():
-    target = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0]])
-    assert_close(smoothed(target, target, torch.eye(3)), torch.eye(3), atol=1e-6, rtol=0)
 
 
 def test_limits_are_in_the_units_and_from_the_zero_of_the_states():
