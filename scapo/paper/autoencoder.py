@@ -7,6 +7,7 @@ it; sizes are docs/method.md's. All lengths are in normalised units (mean radius
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 
 from scapo.geometry.numerics import exact
 from scapo.geometry.points import chamfer, gather
-from scapo.geometry.rigid import project_rotation
+from scapo.geometry.rigid import project_rotation, rotation_angle
 from scapo.paper.vector_neurons import (
     TINY,
     EdgeForm,
@@ -121,6 +122,29 @@ class Encoding:
     def place(self, points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
         """X = S R_g + 1 t_g^T in the paper's letters: aligned to input frame."""
         return points @ self.rotation.mT + self.translation[:, None]
+
+
+ALIKE = 1.0
+"""Frames of one cloud that are this near to each other, in radians, are one answer."""
+
+
+def mean_encoding(looks: Sequence[Encoding]) -> Encoding:
+    """Of the same clouds, seen several times: the mean of those that agree with most others."""
+    rotation = torch.stack([look.rotation for look in looks], 1)  # (B, L, 3, 3)
+    pair = torch.broadcast_tensors(rotation[:, :, None], rotation[:, None])
+    alike = rotation_angle(*pair) < ALIKE  # (B, L, L)
+    row = torch.arange(len(alike), device=alike.device)
+    chosen = alike[row, alike.sum(-1).argmax(-1)].to(rotation)  # (B, L)
+    share = (chosen / chosen.sum(-1, keepdim=True))[..., None]
+    frame = (share[..., None] * rotation).sum(1)
+    with exact(frame.device.type):
+        nearest = project_rotation(frame)
+    return Encoding(
+        frame=frame,
+        rotation=nearest,
+        translation=(share * torch.stack([look.translation for look in looks], 1)).sum(1),
+        code=(share * torch.stack([look.code for look in looks], 1)).sum(1),
+    )
 
 
 def project(frame: Float[Tensor, "*B 3 3"], config: EncoderConfig) -> Float[Tensor, "*B 3 3"]:

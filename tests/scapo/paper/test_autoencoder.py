@@ -7,17 +7,20 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.testing import assert_close
 
 from scapo.first_weights import initialise
 from scapo.geometry.rigid import rotation_angle
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.autoencoder import (
     Decoder,
     DecoderConfig,
     Encoder,
     EncoderConfig,
+    Encoding,
     gram_schmidt,
+    mean_encoding,
     project,
 )
 from tests.helpers.strategies import generator, is_rotation, normal, rotations
@@ -195,3 +198,33 @@ def test_batched_patches_equal_one_network_per_patch() -> None:
 def test_points_that_do_not_divide_are_refused() -> None:
     with pytest.raises(ValueError, match="expected points a multiple of 8 patches, found 1001"):
         DecoderConfig(points=1001)
+
+
+def said(turns: Tensor, shift: float = 0.0) -> Encoding:
+    """Of clouds."""
+    ones = turns.new_ones(len(turns), 3)
+    return Encoding(frame=turns, rotation=turns, translation=shift * ones, code=shift * ones)
+
+
+def test_looks_that_agree_are_averaged_and_one_that_is_turned_round_is_left_out() -> None:
+    truth = rotations(3, 5)
+    small = rotvec_to_rotmat(0.2 * normal(4, 6, 5, 3))
+    around = rotvec_to_rotmat(torch.tensor([0.0, 0.0, 3.0]).double())
+    looks = [said(truth @ turn, 0.1) for turn in small] + [said(truth @ around, 9.0)]
+    found = mean_encoding(looks)
+    assert is_rotation(found.rotation).all()
+    off = rotation_angle(found.rotation, truth)
+    single = torch.stack([rotation_angle(look.rotation, truth) for look in looks[:6]])
+    assert bool((off < single.mean(0)).all())
+    # To first order the mean turn is that of the turns' mean.
+    expected = torch.linalg.norm(0.2 * normal(4, 6, 5, 3).mean(0), dim=-1)
+    assert_close(off, expected, atol=0.03, rtol=0)
+    assert_close(found.translation, torch.full((5, 3), 0.1).double())
+    assert_close(found.code, torch.full((5, 3), 0.1).double())
+
+
+def test_looks_of_one_answer_are_that_answer() -> None:
+    one = said(rotations(3, 5), 0.3)
+    found = mean_encoding([one, one, one])
+    assert_close(found.rotation, one.rotation)
+    assert_close(found.code, one.code)

@@ -10,11 +10,12 @@ import torch
 from torch.testing import assert_close
 
 from scapo.categories import CATEGORIES
+from scapo.geometry.points import normalise
 from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Step
 from scapo.paper.autoencoder import EncoderConfig
 from scapo.paper.config import ScapoConfig
-from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
+from scapo.paper.method import ARTICULATE, CANONICALISE, LOOKS, Scapo
 from scapo.records import map_tensors
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.hinged import plates
@@ -90,6 +91,25 @@ def trained_state() -> dict[str, torch.Tensor]:
     if not _STATE:
         _STATE.update(trained().state_dict())
     return _STATE
+
+
+def test_quick_asks_the_encoder_about_several_samplings_and_fast_about_one() -> None:
+    model = tiny(config=replace(TINY, points=48)).eval()
+    observation = Observation(points=plates(4, 96)[0].points)
+    cloud, _ = normalise(observation.points)
+    asked = []
+    hook = model.encoder.register_forward_pre_hook(lambda _, args: asked.append(args[0]))
+    fast, quick = model.predict(observation), model.predict(observation, "quick")
+    hook.remove()
+    assert [points.shape[1] for points in asked] == [48] * (1 + LOOKS)
+    assert all(torch.equal(points, cloud[:, ::2]) for points in asked[:1])
+    assert len({float(points[0, 0, 0]) for points in asked[1:]}) > LOOKS // 2
+    assert fast.camera_T_part is not None
+    assert quick.camera_T_part is not None
+    assert not torch.equal(fast.camera_T_part, quick.camera_T_part)
+    again = model.predict(observation, "quick").camera_T_part
+    assert again is not None
+    assert torch.equal(again, quick.camera_T_part)
 
 
 def test_predictions_scale_with_the_cloud() -> None:
