@@ -127,7 +127,7 @@ WARM_WHOLE = replace(
     WARM, name="scapo-warm-complete", parts=("complete",), seeds=(1,), training=1500,
     modes=("fast", "refine"), seconds={"fast": 0.01, "refine": 0.15},
     flags=(*WARM.flags, "--loss.recon-form", "squared", "--told-of", "surfaces", "--told", "1000",
-           "--decoder.points", "512", "--encoder-in-stage-2", "frozen", "--loss.dir-align", "0",
+           "--encoder-in-stage-2", "frozen", "--loss.dir-align", "0",
            "--epochs", "60", "2"),
 )  # fmt: skip
 """The same on whole surfaces."""

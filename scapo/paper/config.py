@@ -150,6 +150,7 @@ def warm_config() -> ScapoConfig:
     return replace(
         lean,
         preset="warm",
+        decoder=replace(lean.decoder, points=512),
         loss=replace(lean.loss, recon_form="partial"),
         part_start="run",
         labels_of="told",
