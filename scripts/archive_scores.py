@@ -1,0 +1,87 @@
+#!/usr/bin/env python
+# SPDX-License-Identifier: MIT
+"""Scores into an archive of `results` and back.
+
+    python scripts/archive_scores.py pack ARCHIVE.tar.xz OUT [FILE-PATTERN]
+    python scripts/archive_scores.py restore OUT ARCHIVE.tar.xz [ARCHIVE.tar.xz ...]
+
+OUT is what `scapo-bench run` filled: `OUT/scores/PART/*.csv.gz` and a report beside each. In an
+archive every table lies on its side, one line a column: equal words then stand together, and it
+packs to a third. Restored tables are the same to the byte; only gzip may differ from machine to
+machine, so each report is told the digest of what that gives here.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import json
+import sys
+import tarfile
+from pathlib import Path
+
+from scapo.store.files import sha256_file
+
+
+def turned(table: str) -> str:
+    """A CSV table with its rows as columns; twice gives it back."""
+    text = io.StringIO()
+    rows = zip(*csv.reader(io.StringIO(table)), strict=True)
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def pack(archive: Path, out: Path, pattern: str = "*") -> int:
+    """Archive tables and reports, and say how many tables."""
+    scores = sorted((out / "scores").rglob(f"{pattern}.csv.gz"))
+    with tarfile.open(archive, "w:xz", preset=9) as packed:
+        for path in scores:
+            table = gzip.decompress(path.read_bytes()).decode()
+            lying = turned(table)
+            if turned(lying) != table:
+                raise ValueError(f"{path}: expected a table written by scapo-bench evaluate")
+            report = path.with_name(path.name.removesuffix(".csv.gz") + ".json")
+            name = path.relative_to(out).with_suffix("").as_posix()
+            _add(packed, name, lying.encode())
+            _add(packed, report.relative_to(out).as_posix(), report.read_bytes())
+    return len(scores)
+
+
+def _add(packed: tarfile.TarFile, name: str, data: bytes) -> None:
+    member = tarfile.TarInfo(name)
+    member.size = len(data)  # and no time: equal scores give an equal archive
+    packed.addfile(member, io.BytesIO(data))
+
+
+def restore(archive: Path, out: Path) -> int:
+    """Unpack one archive and say how many tables it held."""
+    with tarfile.open(archive) as packed:
+        names = [out / name for name in packed.getnames() if name.endswith(".csv")]
+        packed.extractall(out, filter="data")
+    for lying in names:
+        scores = lying.with_name(f"{lying.name}.gz")
+        with scores.open("wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as stream:
+            stream.write(turned(lying.read_text()).encode())
+        lying.unlink()
+        report = lying.with_suffix(".json")
+        said = json.loads(report.read_text())
+        said["digests"]["scores"] = sha256_file(scores)
+        report.write_text(json.dumps(said, indent=1, sort_keys=True) + "\n")
+    return len(names)
+
+
+def main(words: list[str]) -> None:
+    """Pack or restore, as the first word says."""
+    match words:
+        case ["pack", archive, out, *pattern] if len(pattern) < 2:
+            print(f"{archive}: {pack(Path(archive), Path(out), *pattern)} tables")
+        case ["restore", out, *archives] if archives:
+            for archive in archives:
+                print(f"{archive}: {restore(Path(archive), Path(out))} tables")
+        case _:
+            sys.exit(__doc__)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
