@@ -198,7 +198,9 @@ def compare_answers(checkpoint: Path) -> dict[str, Differences]:
         raise StoreError(f"{path}: expected answers of {digest[:12]}, found those of another model")
     found = {}
     for mode, said in _asked(checkpoint, kept["points"]):
-        off = {name: np.abs(said[name] - kept[f"{mode}/{name}"]) for name in said}
+        off = {
+            name: np.abs(said[name] - kept[f"{mode}/{name}"].astype(np.float32)) for name in said
+        }
         found[mode] = Differences(
             part_weight=off["part_weight"].max((1, 2)), pose=off["camera_T_part"].max((1, 2, 3))
         )
@@ -206,7 +208,7 @@ def compare_answers(checkpoint: Path) -> dict[str, Differences]:
 
 
 def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[str, np.ndarray]]]:
-    """The answers of each mode, float32."""
+    """The answers of each mode, weights in half precision."""
     method, header = load(checkpoint)
     model = Predictor(method, "cpu", check_header(header, str(checkpoint)).alignment)
     for mode in MODES:
@@ -214,7 +216,7 @@ def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[st
             said = model.predict(points, mode)
         if said.part_weight is None or said.camera_T_part is None:
             raise StoreError(f"{checkpoint}: expected parts and poses in mode {mode}, found none")
-        yield mode, {"part_weight": said.part_weight.float().numpy(),
+        yield mode, {"part_weight": said.part_weight.half().numpy(),
                      "camera_T_part": said.camera_T_part.float().numpy()}  # fmt: skip
 
 
