@@ -16,6 +16,7 @@ import trimesh
 
 from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
+from sim_assets.procedural.cabinets import QUARTER, Cabinet, facing
 from sim_assets.procedural.parameters import (
     HeldOut,
     chance,
@@ -25,7 +26,6 @@ from sim_assets.procedural.parameters import (
     tint,
 )
 from sim_assets.procedural.shapes import (
-    FRONT,
     at,
     box,
     cylinder,
@@ -51,8 +51,6 @@ LEAST = 0.05
 """Height of the lowest bay, m."""
 MORE = "more bays"
 BEHIND = "drawer set back"
-QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""From a grip along a drawer to one along a door."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,15 +73,12 @@ class Bay:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DrawerShape:
+class DrawerShape(Cabinet):
     """Free parameters; lengths in metres, ratios where named so."""
 
     size: float = span(0.32, 0.54, 0.29, 0.62)
-    """Cube root of the cabinet's volume."""
     aspect: float = ratio(0.55, 1.65, 0.45, 2.4)
-    """Depth over width."""
     tall: float = ratio(0.32, 4.8, 0.22, 6.8)
-    """Height over width."""
     share: float = ratio(0.08, 0.5, 0.06, 0.65)
     """Height of the moving drawer's bay over the cabinet's."""
     place: float = span(0.0, 1.0, 0.0, 1.0)
@@ -148,21 +143,6 @@ class DrawerShape:
     )
 
     trait: str = ""
-
-    @property
-    def width(self) -> float:
-        """Along y, without the top's overhang."""
-        return self.size / (self.aspect * self.tall) ** (1 / 3)
-
-    @property
-    def depth(self) -> float:
-        """Along x, without fronts."""
-        return self.aspect * self.width
-
-    @property
-    def height(self) -> float:
-        """Of the cabinet without legs."""
-        return self.tall * self.width
 
     @property
     def columns(self) -> int:
@@ -346,18 +326,18 @@ def _front(s: DrawerShape, bay: Bay) -> list[Visual]:
     if bay.kind == "open":
         return []
     (width, height), (y, z) = s.front(bay)
-    panel = placed(_front_panel(s, width, height), (s.front_x, y, z), FRONT)
+    panel = facing(_front_panel(s, width, height), s.front_x, y, z)
     face = s.front_x - s.front_thickness
     if bay.kind == "door":
         grip = placed(_grip(s, min(0.5 * height, 0.4), width), rotation=QUARTER)
-        grips = [placed(grip, (face, y - 0.4 * width, z), FRONT)]
+        grips = [facing(grip, face, y - 0.4 * width, z)]
     else:
         room = 0.5 * height - min(s.standoff, 0.4 * height) - 0.002
         rise = z + min((s.grip_height - 0.5) * height, max(room, 0.0))
         two = s.double_grip and width > 0.4
         grip = _grip(s, 0.4 * width if two else width, height)
         spots = (-0.27 * width, 0.27 * width) if two else (0.0,)
-        grips = [placed(grip, (face, y + spot, rise), FRONT) for spot in spots]
+        grips = [facing(grip, face, y + spot, rise) for spot in spots]
     return [painted(panel, s.front_color), painted(merged(*grips), s.grip_color)]
 
 

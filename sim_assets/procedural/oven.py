@@ -14,6 +14,7 @@ import trimesh
 
 from sim_assets.objects import Visual
 from sim_assets.procedural.assembly import RGB, Design, Recipe, painted, shade
+from sim_assets.procedural.cabinets import QUARTER, Cabinet, facing
 from sim_assets.procedural.parameters import (
     OTHER_SIDE,
     OTHER_WAY,
@@ -27,7 +28,6 @@ from sim_assets.procedural.parameters import (
 from sim_assets.procedural.shapes import (
     ALONG_X,
     ALONG_Y,
-    FRONT,
     at,
     box,
     cylinder,
@@ -47,20 +47,15 @@ BLACK: RGB = (0.08, 0.08, 0.09)
 GAP = 0.003
 """Between the closed door and the body's front."""
 TRAVEL = radians(90.0)
-TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-"""A quarter turn of a handle on its door."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OvenShape:
+class OvenShape(Cabinet):
     """Free parameters; lengths in metres, ratios where named so."""
 
     size: float = span(0.48, 0.74, 0.42, 0.85)
-    """Cube root of the body's volume."""
     aspect: float = span(0.45, 1.3, 0.36, 1.55)
-    """Depth over width."""
     tall: float = span(0.55, 1.7, 0.42, 2.05)
-    """Height over width."""
     door_low: float = span(0.02, 0.38, 0.01, 0.46)
     """Height of the door's lower edge over the body's height."""
     panel: float = span(0.06, 0.22, 0.05, 0.26)
@@ -121,21 +116,6 @@ class OvenShape:
     trait: str = ""
 
     @property
-    def width(self) -> float:
-        """Along y."""
-        return self.size / (self.aspect * self.tall) ** (1 / 3)
-
-    @property
-    def depth(self) -> float:
-        """Along x, without the door."""
-        return self.aspect * self.width
-
-    @property
-    def height(self) -> float:
-        """Of the body without feet and board."""
-        return self.tall * self.width
-
-    @property
     def low(self) -> float:
         """The z of the door's lower edge; the body's lower face is at z = 0."""
         return self.door_low * self.height
@@ -191,11 +171,6 @@ HELD_OUT: HeldOut = (
 )
 
 
-def _facing(mesh: trimesh.Trimesh, x: float, z: float, y: float = 0.0) -> trimesh.Trimesh:
-    """A panel built as seen from the front, put with its back face at (x, y, z)."""
-    return placed(mesh, (x, y, z), FRONT)
-
-
 def _cavity(s: OvenShape) -> tuple[float, float]:
     """Width and height of the opening behind the door."""
     return s.bay[0] - 2 * s.wall, s.door_height - 2 * min(s.wall, 0.15 * s.door_height)
@@ -207,7 +182,7 @@ def _shell(s: OvenShape) -> trimesh.Trimesh:
     centre = (-s.bay[1], s.low + s.door_height / 2 - s.height / 2)
     back = -s.cavity_depth * s.depth
     rings += [at(rectangle(*_cavity(s), 0.02, centre), z) for z in (0.0, back)]
-    return _facing(loft(rings), 0.0, s.height / 2)
+    return facing(loft(rings), 0.0, z=s.height / 2)
 
 
 def _burners(s: OvenShape) -> list[trimesh.Trimesh]:
@@ -261,7 +236,7 @@ def _controls(s: OvenShape) -> list[Visual]:
     """The strip above the door with knobs and a display, or these on the board behind the top."""
     middle = s.height - s.strip / 2
     strip = slab(s.width, s.strip - 0.002, s.door_thickness + GAP, 0.004, 0.003)
-    visuals = [painted(_facing(strip, 0.0005, middle), s.door_color)]
+    visuals = [painted(facing(strip, 0.0005, z=middle), s.door_color)]
     face, high = s.outer, s.strip
     if s.backsplash and s.rear_controls:
         face, high = s.depth - s.splash_depth - 0.003, s.splash
@@ -276,11 +251,11 @@ def _controls(s: OvenShape) -> list[Visual]:
         slots = np.linspace(-0.42, 0.42, s.knob_count) * s.width
         if s.display:
             slots = slots[np.abs(slots) > 0.14 * s.width + radius]
-        pieces = [_facing(knob, face, middle, y) for y in slots]
+        pieces = [facing(knob, face, z=middle, y=y) for y in slots]
         visuals.append(painted(merged(*pieces), BLACK))
     if s.display:
         screen = slab(0.24 * s.width, 0.5 * high, 0.004, 0.004, 0.001)
-        visuals.append(painted(_facing(screen, face + 0.002, middle), (0.05, 0.12, 0.16)))
+        visuals.append(painted(facing(screen, face + 0.002, z=middle), (0.05, 0.12, 0.16)))
     return visuals
 
 
@@ -296,11 +271,11 @@ def _fronts(s: OvenShape) -> list[Visual]:
         middle = bottom + (k + 0.5) * high
         thick = GAP + (0.2 if s.below == "panel" else 1.0) * s.door_thickness
         front = slab(s.width - 2 * s.door_margin, high - 0.004, thick, 0.004, 0.002)
-        visuals.append(painted(_facing(front, 0.0005, middle), shade(s.door_color, 0.92)))
+        visuals.append(painted(facing(front, 0.0005, z=middle), shade(s.door_color, 0.92)))
         if s.below != "panel":
             grip = slab(0.5 * s.width, 0.014, 0.02, 0.004, 0.002)
             rise = middle + 0.32 * high
-            visuals.append(painted(_facing(grip, 0.001 - thick, rise), shade(s.door_color, 0.6)))
+            visuals.append(painted(facing(grip, 0.001 - thick, z=rise), shade(s.door_color, 0.6)))
     return visuals
 
 
@@ -325,8 +300,8 @@ def _frame(s: OvenShape) -> list[Visual]:
         leaf = slab(s.door_width, s.door_height, GAP + s.door_thickness, 0.008, 0.004)
         middle = s.low + s.door_height / 2
         pane = slab(0.6 * s.door_width, 0.4 * s.door_height, 0.002, 0.01)
-        visuals.append(painted(_facing(leaf, 0.0005, middle, -s.bay[1]), s.door_color))
-        visuals.append(painted(_facing(pane, s.outer + 0.001, middle, -s.bay[1]), BLACK))
+        visuals.append(painted(facing(leaf, 0.0005, z=middle, y=-s.bay[1]), s.door_color))
+        visuals.append(painted(facing(pane, s.outer + 0.001, z=middle, y=-s.bay[1]), BLACK))
         visuals.append(painted(placed(_handle(s), (0.0, -2 * s.bay[1], 0.0)), STEEL))
     return visuals
 
@@ -351,7 +326,7 @@ def _body(s: OvenShape) -> list[Visual]:
     outer, inner = rectangle(width, height, 0.02), rectangle(width - 0.002, height - 0.002, 0.019)
     rings = [at(outer, -depth - 0.001), at(outer, -0.002), at(inner, -0.002)]
     rings.append(at(inner, -depth + 0.001))
-    lining = _facing(loft(rings), 0.0, s.low + s.door_height / 2, s.bay[1])
+    lining = facing(loft(rings), 0.0, z=s.low + s.door_height / 2, y=s.bay[1])
     visuals.append(painted(lining, s.inner_color))
     if s.rack:
         visuals.append(painted(_rack(s), STEEL))
@@ -376,11 +351,11 @@ def _handle(s: OvenShape) -> trimesh.Trimesh:
     """Near the edge that comes forward."""
     middle = s.low + s.door_height / 2
     if s.upright:
-        grip = placed(_grip(s, s.handle_length * s.door_height / 2), rotation=TURN)
-        return _facing(grip, s.outer, middle, s.bay[1] - (s.handle_rise - 0.5) * s.door_width)
+        grip = placed(_grip(s, s.handle_length * s.door_height / 2), rotation=QUARTER)
+        return facing(grip, s.outer, z=middle, y=s.bay[1] - (s.handle_rise - 0.5) * s.door_width)
     side = -1 if s.trait == OTHER_WAY else 1
     rise = middle + side * (s.handle_rise - 0.5) * s.door_height
-    return _facing(_grip(s, s.handle_length * s.door_width / 2), s.outer, rise, s.bay[1])
+    return facing(_grip(s, s.handle_length * s.door_width / 2), s.outer, z=rise, y=s.bay[1])
 
 
 def _door(s: OvenShape) -> list[Visual]:
@@ -397,8 +372,8 @@ def _door(s: OvenShape) -> list[Visual]:
             slab(size[0] + 0.004, size[1] + 0.004, 0.5 * s.door_thickness, 0.02),
             (*centre, 0.25 * s.door_thickness),
         )
-        visuals.append(painted(_facing(pane, -GAP, middle, y), (0.1, 0.11, 0.13)))
-    frame = _facing(loft(rings, ring=s.window), -GAP, middle, y)
+        visuals.append(painted(facing(pane, -GAP, z=middle, y=y), (0.1, 0.11, 0.13)))
+    frame = facing(loft(rings, ring=s.window), -GAP, z=middle, y=y)
     return [painted(frame, s.door_color), *visuals]
 
 

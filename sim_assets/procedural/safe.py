@@ -24,6 +24,7 @@ from sim_assets.procedural.assembly import (
     painted,
     shade,
 )
+from sim_assets.procedural.cabinets import Cabinet, facing
 from sim_assets.procedural.parameters import (
     OTHER_SIDE,
     OTHER_WAY,
@@ -38,7 +39,6 @@ from sim_assets.procedural.parameters import (
 from sim_assets.procedural.shapes import (
     ALONG_X,
     ALONG_Y,
-    FRONT,
     at,
     box,
     cylinder,
@@ -61,15 +61,12 @@ TRAVEL = radians(110.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SafeShape:
+class SafeShape(Cabinet):
     """Free parameters; lengths in metres, ratios where named so."""
 
     size: float = span(0.26, 0.56, 0.22, 0.68)
-    """Cube root of the body's volume."""
     aspect: float = ratio(0.36, 1.45, 0.29, 1.8)
-    """Depth over width."""
     tall: float = ratio(0.38, 2.2, 0.29, 2.8)
-    """Height over width."""
     wall: float = span(0.05, 0.11, 0.035, 0.13)
     """Over the front's smaller side."""
     door_thickness: float = ratio(0.022, 0.5, 0.018, 0.6)
@@ -129,21 +126,6 @@ class SafeShape:
         (0.5, 0.5, 0.52), (0.3, 0.12, 0.12), (0.2, 0.25, 0.35)
     )
     trait: str = ""
-
-    @property
-    def width(self) -> float:
-        """Along y."""
-        return self.size / (self.aspect * self.tall) ** (1 / 3)
-
-    @property
-    def depth(self) -> float:
-        """Along x, without the door."""
-        return self.aspect * self.width
-
-    @property
-    def height(self) -> float:
-        """Without feet."""
-        return self.tall * self.width
 
     @property
     def side(self) -> float:
@@ -230,19 +212,14 @@ HELD_OUT: HeldOut = (
 )
 
 
-def _facing(mesh: trimesh.Trimesh, x: float, y: float = 0.0, z: float = 0.0) -> trimesh.Trimesh:
-    """A thing built as seen from the front, put with its z = 0 at (x, y, z)."""
-    return placed(mesh, (x, y, z), FRONT)
-
-
 def _body(s: SafeShape) -> list[Visual]:
     """The shell with its cavity, a lining, feet, a shelf and the body's hinge knuckles."""
     rings = rounded_sides(s.width, s.height, s.corner_radius, s.bevel, (-s.depth, 0.0))
     back, (y, z) = -s.depth + s.edge, (s.beside / 2, s.centre[1])
     rings += [at(rectangle(*s.cavity, 0.004, (-y, z)), level) for level in (0.0, back)]
-    visuals = [painted(_facing(loft(rings), 0.0), s.body_color)]
+    visuals = [painted(facing(loft(rings), 0.0), s.body_color)]
     lining = tub((*s.cavity, -back - 0.006), 0.001, 0.001, 0.004)
-    visuals.append(painted(_facing(lining, -back, y, z), s.inner_color))
+    visuals.append(painted(facing(lining, -back, y, z), s.inner_color))
     if s.shelf:
         width, height = s.cavity
         level = z - height / 2 + s.shelf_height * height
@@ -265,19 +242,19 @@ def _surround(s: SafeShape) -> list[Visual]:
     right = -s.width / 2 + s.beside / 2
     if s.side_panel:
         panel = slab(s.beside - 0.002, high - low - 0.012, t, 0.004, s.bevel)
-        visuals.append(painted(_facing(panel, 5e-4, right, s.centre[1]), shade(s.body_color, 0.8)))
+        visuals.append(painted(facing(panel, 5e-4, right, s.centre[1]), shade(s.body_color, 0.8)))
         visuals += _controls(s, right)
     if s.crowned:
         strip = slab(s.width - 0.002, top - high, t, 0.004, s.bevel)
-        visuals.append(painted(_facing(strip, 5e-4, 0.0, (top + high) / 2), s.body_color))
+        visuals.append(painted(facing(strip, 5e-4, 0.0, (top + high) / 2), s.body_color))
     if low > -0.45 * s.height:
         bottom = -s.height / 2 + s.bevel
         block = slab(s.width - 0.002, low - bottom, t, 0.004, s.bevel)
-        visuals.append(painted(_facing(block, 5e-4, 0.0, (low + bottom) / 2), s.body_color))
+        visuals.append(painted(facing(block, 5e-4, 0.0, (low + bottom) / 2), s.body_color))
         if s.below == "second door":
             grip = placed(_bar(s, 0.5 * (low - bottom)), rotation=np.eye(3))
             place = (s.outer, -0.4 * s.width, (low + bottom) / 2)
-            visuals.append(painted(_facing(grip, *place), STEEL))
+            visuals.append(painted(facing(grip, *place), STEEL))
     if _visible(s):
         visuals.append(painted(_knuckles(s)[0], shade(s.body_color, 0.8)))
     return visuals
@@ -288,18 +265,18 @@ def _controls(s: SafeShape, y: float) -> list[Visual]:
     low, high = s.levels
     tall, wide = high - low, s.beside
     screen = slab(0.7 * wide, 0.14 * tall, 0.004, 0.002, 0.001)
-    visuals = [painted(_facing(screen, s.outer + 0.001, y, s.centre[1] + 0.32 * tall), BLACK)]
+    visuals = [painted(facing(screen, s.outer + 0.001, y, s.centre[1] + 0.32 * tall), BLACK)]
     pieces = []
     if "keypad" in s.lock:
         key = slab(0.17 * wide, 0.05 * tall, 0.005, 0.002, 0.001)
         spots = [(i, j) for i in (-0.25, 0.0, 0.25) for j in (-0.3, -0.2, -0.1, 0.0, 0.1)]
         pieces = [
-            _facing(key, s.outer + 0.002, y + i * wide, s.centre[1] + j * tall) for i, j in spots
+            facing(key, s.outer + 0.002, y + i * wide, s.centre[1] + j * tall) for i, j in spots
         ]
     else:
         r = min(0.3 * wide, 0.12 * tall)
         knob = lathe([(r, -0.002), (r, 0.012), (0.8 * r, 0.026)], 24)
-        pieces = [_facing(knob, s.outer, y, s.centre[1] + j * tall) for j in (-0.25, 0.05)]
+        pieces = [facing(knob, s.outer, y, s.centre[1] + j * tall) for j in (-0.25, 0.05)]
     return [*visuals, painted(merged(*pieces), STEEL)]
 
 
@@ -396,22 +373,22 @@ def _lock(s: SafeShape) -> list[Visual]:
     y, z = s.centre
     if s.lock != "slot" and (s.lock == "bar" or s.front == "window" or s.side_panel):
         bar = _bar(s, s.bar_length * height)
-        return [painted(_facing(bar, s.outer, y - width / 2 + 0.05 * width + 0.012, z), STEEL)]
+        return [painted(facing(bar, s.outer, y - width / 2 + 0.05 * width + 0.012, z), STEEL)]
     if s.lock == "slot":
         plate = slab(0.03, min(0.16, 0.4 * height), 0.003, 0.006, 0.001)
         place = (s.face + 0.001, y - 0.5 * width + 0.05 * width + 0.02, z)
-        return [painted(_facing(plate, *place), BLACK)]
+        return [painted(facing(plate, *place), BLACK)]
     right, rise = y - 0.12 * width, 0.2 * height
     visuals = []
     if "keypad" in s.lock:
-        visuals.append(painted(_facing(_keypad(s), s.face, right, z + rise), BLACK))
+        visuals.append(painted(facing(_keypad(s), s.face, right, z + rise), BLACK))
     if "dial" in s.lock:
         place = right + (0.3 * width if "keypad" in s.lock else 0.0)
-        visuals.append(painted(_facing(_dial(s), s.face, place, z + rise), STEEL))
+        visuals.append(painted(facing(_dial(s), s.face, place, z + rise), STEEL))
     if "wheel" in s.lock:
-        visuals.append(painted(_facing(_wheel(s), s.face, right, z - 0.8 * rise), STEEL))
+        visuals.append(painted(facing(_wheel(s), s.face, right, z - 0.8 * rise), STEEL))
     elif s.lever:
-        visuals.append(painted(_facing(_lever(s), s.face, right, z - rise), STEEL))
+        visuals.append(painted(facing(_lever(s), s.face, right, z - rise), STEEL))
     return visuals
 
 
@@ -428,8 +405,8 @@ def _slab(s: SafeShape) -> list[Visual]:
         size = (s.window * (width - 0.06), 0.9 * s.window * height)
         rings += [at(rectangle(*size, 0.01, (-0.01, 0.0)), level) for level in (t, 0.7 * t)]
         pane = placed(slab(size[0] + 2e-3, size[1] + 2e-3, 0.1 * t, 0.01), (-0.01, 0.0, 0.65 * t))
-        visuals.append(painted(_facing(pane, -GAP, y, z), BLACK))
-    return [painted(_facing(loft(rings), -GAP, y, z), s.body_color), *visuals]
+        visuals.append(painted(facing(pane, -GAP, y, z), BLACK))
+    return [painted(facing(loft(rings), -GAP, y, z), s.body_color), *visuals]
 
 
 def _door(s: SafeShape) -> list[Visual]:
@@ -441,7 +418,7 @@ def _door(s: SafeShape) -> list[Visual]:
         max(s.cavity[1] - 2 * clear - 0.012, 0.02),
     )
     block = slab(*size, s.plug + GAP + 0.001, 0.006)
-    visuals.append(painted(_facing(block, s.plug, *middle), shade(s.inner_color, 0.8)))
+    visuals.append(painted(facing(block, s.plug, *middle), shade(s.inner_color, 0.8)))
     if s.bolts:
         reach = size[0] / 2 + 0.008
         bolt = cylinder(0.3 * s.plug, -reach, 0.0, 0.0, 12)
@@ -451,7 +428,7 @@ def _door(s: SafeShape) -> list[Visual]:
     if s.plate:
         plate = slab(0.2 * s.side, 0.05 * s.side, 0.002, 0.002)
         place = (s.centre[0] + 0.25 * s.door[0], s.centre[1] - 0.4 * s.door[1] + 0.02)
-        visuals.append(painted(_facing(plate, s.face + 0.0005, *place), STEEL))
+        visuals.append(painted(facing(plate, s.face + 0.0005, *place), STEEL))
     if _visible(s):
         visuals.append(painted(_knuckles(s)[1], shade(s.body_color, 0.8)))
     if s.trait == SET_BACK:

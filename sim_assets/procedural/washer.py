@@ -23,6 +23,7 @@ from sim_assets.procedural.assembly import (
     painted,
     shade,
 )
+from sim_assets.procedural.cabinets import Cabinet, facing
 from sim_assets.procedural.parameters import (
     OTHER_SIDE,
     OTHER_WAY,
@@ -34,7 +35,6 @@ from sim_assets.procedural.parameters import (
     tint,
 )
 from sim_assets.procedural.shapes import (
-    FRONT,
     at,
     box,
     cylinder,
@@ -57,15 +57,12 @@ ROUND = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WasherShape:
+class WasherShape(Cabinet):
     """Free parameters; lengths in metres, ratios where named so."""
 
     size: float = span(0.5, 0.74, 0.44, 0.82)
-    """Cube root of the body's volume."""
     aspect: float = span(0.58, 1.22, 0.48, 1.45)
-    """Depth over width."""
     tall: float = span(0.85, 1.7, 0.7, 2.0)
-    """Height over width."""
     corner_radius: float = span(0.006, 0.03, 0.003, 0.05)
     bevel: float = span(0.002, 0.009, 0.001, 0.014)
     door_radius: float = span(0.24, 0.41, 0.2, 0.45)
@@ -126,21 +123,6 @@ class WasherShape:
     )
     glass_color: tuple[float, float, float] = tint((0.3, 0.36, 0.4), (0.18, 0.2, 0.22))
     trait: str = ""
-
-    @property
-    def width(self) -> float:
-        """Along y."""
-        return self.size / (self.aspect * self.tall) ** (1 / 3)
-
-    @property
-    def depth(self) -> float:
-        """Along x."""
-        return self.aspect * self.width
-
-    @property
-    def height(self) -> float:
-        """Of the cabinet without feet, pedestal and top."""
-        return self.tall * self.width
 
     @property
     def strip(self) -> float:
@@ -207,11 +189,6 @@ def _circle(radius: float) -> np.ndarray:
     return rectangle(2 * radius, 2 * radius, radius, segments=ROUND)
 
 
-def _facing(mesh: trimesh.Trimesh, x: float, y: float = 0.0, z: float = 0.0) -> trimesh.Trimesh:
-    """A thing built as seen from the front, put with its z = 0 at (x, y, z)."""
-    return placed(mesh, (x, y, z), FRONT)
-
-
 def _cabinet(s: WasherShape) -> trimesh.Trimesh:
     """Outside from back to front, then through the round opening to the back of the drum."""
     heights = np.array([-s.depth, -s.depth + s.bevel, -s.bevel, 0.0])
@@ -232,7 +209,7 @@ def _cabinet(s: WasherShape) -> trimesh.Trimesh:
     else:
         rings.append(at(hole, 0.0))
     rings.append(at(hole, -s.drum_depth * s.depth))
-    return _facing(loft(rings), 0.0, 0.0, s.height / 2)
+    return facing(loft(rings), 0.0, 0.0, s.height / 2)
 
 
 def _drum(s: WasherShape) -> list[Visual]:
@@ -240,18 +217,18 @@ def _drum(s: WasherShape) -> list[Visual]:
     r, depth = s.hole_radius, s.drum_depth * s.depth
     profile = [(r, 0.0), (r, depth - 0.05), (r - 0.002, depth - 0.05), (r - 0.002, 0.002)]
     drum = lathe(profile, 36)
-    visuals = [painted(_facing(drum, depth - 0.001, s.aside, s.middle), STEEL)]
+    visuals = [painted(facing(drum, depth - 0.001, s.aside, s.middle), STEEL)]
     lip = [(r - 0.009, -0.022), (r, -0.022), (r, -0.001), (r - 0.004, -0.001)]
     ring = loft([at(superellipse(2 * k, 2 * k, 2.0, 36), z) for k, z in lip], ring=True)
     inner = 0.006 if s.pocket else 0.0
-    visuals.append(painted(_facing(ring, inner, s.aside, s.middle), (0.3, 0.3, 0.32)))
+    visuals.append(painted(facing(ring, inner, s.aside, s.middle), (0.3, 0.3, 0.32)))
     if s.lifters:
         ridge = box((-0.012, r - 0.035, 0.004), (0.012, r - 0.001, 0.35 * depth))
         angles = np.radians([30.0, 150.0, 270.0])
         ridges = []
         for a in angles:
             turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-            ridges.append(_facing(placed(ridge, rotation=turn), depth, s.aside, s.middle))
+            ridges.append(facing(placed(ridge, rotation=turn), depth, s.aside, s.middle))
         visuals.append(painted(merged(*ridges), shade(STEEL, 0.9)))
     return visuals
 
@@ -261,27 +238,27 @@ def _controls(s: WasherShape) -> list[Visual]:
     strip = s.strip
     z = s.height - strip / 2 - s.bevel
     plate = slab(s.width - 2 * s.bevel - 0.004, strip - 0.006, 0.006, 0.006, 0.002)
-    visuals = [painted(_facing(plate, 0.001, 0.0, z), shade(s.body_color, 0.9))]
+    visuals = [painted(facing(plate, 0.001, 0.0, z), shade(s.body_color, 0.9))]
     x = -0.0045
     r = min(s.dial_radius * strip, 0.06)
     dial = lathe([(1.2 * r, 0.0), (1.2 * r, 0.003), (r, 0.004), (0.92 * r, 0.024),
                   (0.82 * r, 0.027)], 24)  # fmt: skip
     y = -s.dial_side * 0.12 * s.width
-    visuals.append(painted(_facing(dial, x, y, z), STEEL))
+    visuals.append(painted(facing(dial, x, y, z), STEEL))
     if s.tray:
         width = s.tray_width * s.width
         tray = slab(width, 0.72 * strip, 0.006, 0.006, 0.002)
         grip = slab(0.5 * width, 0.012, 0.012, 0.004, 0.002)
         place = (0.5 - 0.03) * s.width - width / 2
         both = merged(tray, placed(grip, (0.0, -0.2 * strip, 0.003)))
-        visuals.append(painted(_facing(both, x, place, z), s.body_color))
+        visuals.append(painted(facing(both, x, place, z), s.body_color))
     if s.display:
         screen = slab(0.16 * s.width, 0.4 * strip, 0.003, 0.003, 0.001)
-        visuals.append(painted(_facing(screen, x, -0.36 * s.width, z + 0.12 * strip), BLACK))
+        visuals.append(painted(facing(screen, x, -0.36 * s.width, z + 0.12 * strip), BLACK))
     if s.buttons:
         button = cylinder(0.09 * strip, 0.0, 0.006, 0.0015, 12)
         row = np.linspace(-0.43, -0.29, 4) * s.width
-        pieces = [_facing(button, x, y, z - 0.3 * strip) for y in row]
+        pieces = [facing(button, x, y, z - 0.3 * strip) for y in row]
         visuals.append(painted(merged(*pieces), shade(s.body_color, 0.6)))
     return visuals
 
@@ -291,7 +268,7 @@ def _body(s: WasherShape) -> list[Visual]:
     if s.plinth_flap:
         flap = slab(0.94 * s.width, s.flap * s.height, 0.004, 0.006, 0.001)
         middle = s.bevel + 0.006 + s.flap * s.height / 2
-        visuals.append(painted(_facing(flap, 0.0015, 0.0, middle), shade(s.body_color, 0.85)))
+        visuals.append(painted(facing(flap, 0.0015, 0.0, middle), shade(s.body_color, 0.85)))
     if s.worktop:
         top = slab(s.depth + 0.004, s.width + 0.004, s.top_height, 0.01, 0.005)
         place = (s.depth / 2, 0.0, s.height - 0.002)
@@ -314,8 +291,8 @@ def _stand(s: WasherShape) -> list[Visual]:
         front = slab(s.width - 0.05, -0.8 * low, 0.012, 0.006, 0.003)
         grip = slab(0.4 * s.width, 0.016, 0.018, 0.005, 0.003)
         visuals.append(painted(block, shade(s.body_color, 0.85)))
-        visuals.append(painted(_facing(front, 0.006, 0.0, low / 2), s.body_color))
-        visuals.append(painted(_facing(grip, -0.005, 0.0, 0.25 * low), shade(s.body_color, 0.5)))
+        visuals.append(painted(facing(front, 0.006, 0.0, low / 2), s.body_color))
+        visuals.append(painted(facing(grip, -0.005, 0.0, 0.25 * low), shade(s.body_color, 0.5)))
     if s.feet:
         foot = cylinder(0.025, low - s.foot_height, low + 0.004, 0.003, 16)
         x, y = (0.06, s.depth - 0.06), s.width / 2 - 0.06
@@ -361,7 +338,7 @@ def _ring(s: WasherShape) -> trimesh.Trimesh:
         at(superellipse(2 * r, 2 * r, power, 40), z)
         for (r, z), power in zip(profile, powers, strict=True)
     ]
-    return _facing(loft(loops, ring=True), -GAP, 0.0, s.middle)
+    return facing(loft(loops, ring=True), -GAP, 0.0, s.middle)
 
 
 def _bowl(s: WasherShape) -> trimesh.Trimesh:
@@ -371,7 +348,7 @@ def _bowl(s: WasherShape) -> trimesh.Trimesh:
     mouth = 0.5 * s.ring_thickness
     outside = [(0.6 * small, deep), (small, deep + 0.004), (inner - 0.006, -0.012), (inner, 0.001)]
     inside = [(r - 0.005, z + 0.005) for r, z in outside[::-1]]
-    return _facing(
+    return facing(
         lathe([*outside, (inner, mouth), (inner - 0.005, mouth), *inside], 36),
         -GAP, 0.0, s.middle,
     )  # fmt: skip
@@ -384,17 +361,17 @@ def _handle(s: WasherShape) -> trimesh.Trimesh:
     if s.handle == "bar":
         bar = cylinder(0.009, s.middle - 0.07, s.middle + 0.07, 0.003, 14)
         post = cylinder(0.006, -0.004, 0.028, 0.0, 10)
-        posts = [_facing(post, x, -r, s.middle + side * 0.055) for side in (-1, 1)]
+        posts = [facing(post, x, -r, s.middle + side * 0.055) for side in (-1, 1)]
         return merged(placed(bar, (x - 0.028, -r, 0.0)), *posts)
     if s.handle == "scoop":
         plate = slab(0.5 * wide, 0.13, 0.012, 0.2 * wide, 0.004)
         lip = slab(0.12 * wide, 0.12, 0.02, 0.05 * wide, 0.002)
-        return merged(*(_facing(k, x + 0.004, -r + d, s.middle)
+        return merged(*(facing(k, x + 0.004, -r + d, s.middle)
                         for k, d in ((plate, 0.0), (lip, 0.14 * wide))))  # fmt: skip
     profile = [(0.3 * wide, -0.004), (0.3 * wide, 0.01), (0.2 * wide, 0.018)]
     bump = lathe(profile, 20)
     stretched = trimesh.Trimesh(bump.vertices * [1.0, 2.2, 1.0], bump.faces, process=False)
-    return _facing(stretched, x, -r, s.middle)
+    return facing(stretched, x, -r, s.middle)
 
 
 def _door(s: WasherShape) -> list[Visual]:
@@ -414,7 +391,7 @@ def _door(s: WasherShape) -> list[Visual]:
                    (r + 0.004, t + 0.002)]  # fmt: skip
         loops = [at(superellipse(2 * k, 2 * k, 2.0, 40), z) for k, z in profile]
         trim = loft([*loops[1:], loops[0]], ring=True)
-        visuals.append(painted(_facing(trim, -GAP, 0.0, s.middle), STEEL))
+        visuals.append(painted(facing(trim, -GAP, 0.0, s.middle), STEEL))
     return _hung(s, visuals)
 
 
