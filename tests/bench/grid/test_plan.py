@@ -37,6 +37,8 @@ def test_the_grid_has_every_method_of_every_table(cpu: Plan):
             assert found[category, "gcn3d"] == found[category, "pointnet2"] == 1
     ablated = {c.label for c in cpu.chains if c.label.startswith("scapo-wo-")}
     assert len(ablated) == 4
+    weights = {cpu.configs[label]["config"]["loss"]["dir_align"] for label in ablated}
+    assert weights == {cpu.configs["scapo-full"]["config"]["loss"]["dir_align"]} == {0.1}
     assert [cpu.configs[label]["config"]["loss"]["without"] for label in sorted(ablated)] == [
         ["dir_align"], ["joint_boundary"], ["joint_prox"], ["shape_var"]
     ]  # fmt: skip
@@ -51,7 +53,7 @@ def test_a_warm_start_begins_at_a_released_model(tmp_path: Path, monkeypatch):
         path.write_text(name)
     monkeypatch.setattr("bench.grid.plan.weights", lambda: models)
     plan = make_plan("cpu", tmp_path)
-    begun = [c for c in plan.chains if c.label.startswith(("scapo-warm", "scapo-wo-"))]
+    begun = [c for c in plan.chains if c.label.startswith(("scapo-w", "scapo-full"))]
     assert {c.name.partition("/")[0] for c in begun} == {"clean", "complete", "sensor"}
     for chain in begun:
         train = chain.steps[0]

@@ -364,7 +364,9 @@ def test_the_preset_leaves_the_base_free_and_takes_partial_clouds() -> None:
     preset = warm_config()
     assert preset.part_start == "run"
     assert not preset.joint.base_fixed
-    assert preset.loss.recon_form == "partial"
+    assert (preset.loss.recon_form, preset.loss.dir_align) == ("robust", 0)
+    stages = Scapo(preset, CATEGORIES["laptop"], generator(0)).stages()
+    assert not {"encoder", "decoder"} & {group.module for group in stages[1].parameters}
     assert Scapo(preset, CATEGORIES["laptop"], generator(0)).variant == "warm"
 
 
