@@ -14,7 +14,7 @@ Lengths are in units of four times the mean radius of the cloud.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import ClassVar, Literal
 
 import torch
@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bench.baselines.answers import Target, exchanged, states
+from bench.baselines.answers import Target, exchange, exchanged, states
 from bench.baselines.npcs_network import Answer, NetworkConfig, NpcsNetwork
 from bench.baselines.similarity_ransac import Similarities, ransac
 from scapo.categories import Category
@@ -37,12 +37,13 @@ from scapo.method import (
     Step,
     StepDecay,
     changes,
-    evenly,
 )
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 FEWEST = 8
 """Points that a part or a joint is found from at least, the likeliest if no more are its own."""
+LOOKS = 4
+"""Most clouds that a prediction deals."""
 MARGIN = 1.1
 """Of the boxes over what the training clouds show."""
 SMOOTH = 1e-6
@@ -56,8 +57,8 @@ class NpcsEpnConfig:
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""
     points: int = 1024
-    """Points that the network sees: random ones in training, evenly taken from the cloud's order
-    for a prediction, which reaches the others by interpolation."""
+    """Points that the network sees: random ones in training. A prediction deals the cloud into
+    such clouds, asks up to four about all points by interpolation, and takes the mean."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Sizes of the network."""
     reach: float = 0.2
@@ -267,8 +268,7 @@ class NpcsEpn(AbstractMethod):
         """Parts, poses by RANSAC, joints by votes; there is one way for both modes."""
         del mode
         points, similarity = normalise(observation.points)
-        chosen = evenly(points.shape[1], self.config.points).to(points.device)
-        answer = self.network(points[:, chosen], points)
+        answer = self.answer_all(points)
         poses = [self._pose(points, answer, p) for p in range(len(self.category.parts))]
         rotation = torch.stack([pose.rotation for pose in poses], 1)
         pose = rigid(rotation, torch.stack([pose.shift for pose in poses], 1))
@@ -285,6 +285,52 @@ class NpcsEpn(AbstractMethod):
                 state=torch.where(slide.to(state.device), state / similarity.scale[:, None], state),
             ),
         )
+
+    def answer_all(self, points: Float[Tensor, "B N 3"]) -> Answer:
+        """The mean of what the network says of all points from each of the clouds dealt of them.
+
+        Where parts exchange, each look may read the cloud in either order: all are brought to the
+        one in which they name the parts as the first does.
+        """
+        hands = -(-points.shape[1] // self.config.points)
+        dealt = [points[:, hand::hands] for hand in range(min(hands, LOOKS))]
+        first, *others = (self.network(some, points) for some in dealt)
+        looks = [first, *(self._as_first(first, look) for look in others)]
+        return Answer(
+            part=_mean_logits([look.part for look in looks]),
+            coordinate=torch.stack([look.coordinate for look in looks]).mean(0),
+            joint=_mean_logits([look.joint for look in looks]),
+            heat=torch.stack([look.heat for look in looks]).mean(0),
+            towards=F.normalize(torch.stack([look.towards for look in looks]).sum(0), dim=-1),
+            axis=F.normalize(torch.stack([look.axis for look in looks]).sum(0), dim=-1),
+        )
+
+    def _as_first(self, first: Answer, look: Answer) -> Answer:
+        """A look with the parts of each cloud exchanged where they are then more like the first's.
+
+        Exchanged, a part has the frame of the other times the symmetry (`answers.exchanged`).
+        """
+        if not self.config.either_order or self.category.symmetry is None:
+            return look
+        order, joints, sign = exchange(len(self.category.parts))
+        turn = look.coordinate.new_tensor(self.category.symmetry)
+        size, centre = self.box_size[:, None], self.box_centre
+        place = ((look.coordinate - 0.5) * size + centre)[..., order, :] @ turn
+        other = Answer(
+            part=look.part[..., order],
+            coordinate=(place - centre) / size + 0.5,
+            joint=look.joint[..., [*joints, len(joints)]],
+            heat=look.heat,
+            towards=look.towards @ turn,
+            axis=sign * look.axis @ turn,
+        )
+        said = first.part.argmax(-1)
+        alike = [(one.part.argmax(-1) == said).sum(1) for one in (look, other)]
+        swap = alike[1] > alike[0]
+        names = [one.name for one in fields(Answer)]
+        pairs = [(getattr(look, name), getattr(other, name)) for name in names]
+        chosen = [torch.where(swap.view(-1, *(1,) * (a.ndim - 1)), b, a) for a, b in pairs]
+        return Answer(**dict(zip(names, chosen, strict=True)))
 
     def _pose(self, points: Float[Tensor, "B N 3"], answer: Answer, p: int) -> Similarities:
         """Of one part, in the cloud, from the points that are most likely its own."""
@@ -309,6 +355,11 @@ class NpcsEpn(AbstractMethod):
             pivots.append(median(place, near))
             axes.append(F.normalize(median(axis, near), dim=-1))
         return torch.stack(pivots, 1), torch.stack(axes, 1)
+
+
+def _mean_logits(looks: list[Tensor]) -> Tensor:
+    """Of the mean probabilities."""
+    return torch.stack([look.softmax(-1) for look in looks]).mean(0).clamp_min(SMOOTH).log()
 
 
 def own_frame(pose: Float[Tensor, "B P 4 4"], part: Int[Tensor, "B N"]) -> Float[Tensor, "B N 4 4"]:

@@ -228,6 +228,45 @@ def test_the_truth_costs_nothing_in_either_order() -> None:
         assert answer.coordinate.max() < 1
 
 
+def test_looks_in_another_order_are_brought_to_the_first() -> None:
+    """A true answer in one order becomes the true answer in the other, cloud by cloud."""
+    observation, labels = plates(3, 200, seed=5)
+    method = made().eval()
+    method.start("learn", observation, labels, generator(0))
+    points, target, _ = method._normalised(observation, labels)
+    other = exchanged(target, torch.tensor(LAPTOP.symmetry).float())
+    here, there = (perfect(method, points, one) for one in (target, other))
+    for first, look in ((here, there), (there, here), (here, here)):
+        brought = method._as_first(first, look)
+        for name in ("part", "coordinate", "joint", "heat", "towards", "axis"):
+            assert_close(getattr(brought, name), getattr(first, name), atol=1e-4, rtol=0)
+    as_they_are = made(replace(TINY, either_order=False))._as_first(here, there)
+    assert as_they_are is there
+
+
+def test_a_prediction_is_the_mean_of_its_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    observation, labels = plates(2, 200, seed=5)
+    method = made(replace(TINY, points=32)).eval()  # seven clouds, of which four are asked
+    method.start("learn", observation, labels, generator(0))
+    points, target, _ = method._normalised(observation, labels)
+    truth, seen = perfect(method, points, target), []
+
+    def look(some: Tensor, asked: Tensor):
+        seen.append(some)
+        assert_close(asked, points)
+        sure = 4.0 * len(seen)
+        return replace(truth, part=truth.part * sure / 20, heat=truth.heat / len(seen))
+
+    monkeypatch.setattr(method.network, "forward", look)
+    mean = method.answer_all(points)
+    assert [some.shape[1] for some in seen] == [29, 29, 29, 29]
+    assert len(torch.cat(seen, 1)[0].unique(dim=0)) == 4 * 29
+    assert_close(mean.heat, truth.heat * (1 + 1 / 2 + 1 / 3 + 1 / 4) / 4)
+    share = torch.sigmoid(torch.tensor([4.0, 8.0, 12.0, 16.0])).mean()
+    assert_close(mean.part.softmax(-1).amax(-1), share.expand(2, 200), atol=1e-5, rtol=0)
+    assert_close(mean.axis, truth.axis)
+
+
 def test_true_answers_become_true_poses_and_joints() -> None:
     observation, labels = plates(3, 200, seed=5)
     method = made().eval()
