@@ -7,6 +7,7 @@ import gzip
 import json
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 import pytest
@@ -45,18 +46,23 @@ def test_scores_are_restored_to_the_byte(tmp_path: Path):
     assert said == {"summary": {"n": 2}, "digests": {"scores": sha256_file(back)}}
 
 
+COLUMNS = [
+    "method", "variant", "seed", "data", "category", "split", "sample", "metric",
+    "slot", "value", "unit",
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
     "archive", sorted((ROOT / "results").rglob("*.tar.xz")), ids=lambda path: path.name
 )
-def test_archives_hold_scores_of_samples(archive: Path, tmp_path: Path):
-    """Every table begins with the columns of the contract, every report names its table."""
-    run("restore", tmp_path, archive)
-    tables = sorted(tmp_path.rglob("*.csv.gz"))
+def test_archives_hold_tables_on_their_sides_and_reports(archive: Path):
+    """One line for each column of the contract; read here, since restoring all takes long."""
+    with tarfile.open(archive) as packed:
+        files = {one.name: file.read() for one in packed if (file := packed.extractfile(one))}
+    tables = [name for name in files if name.endswith(".csv")]
     assert len(tables) >= 18
-    for table in tables:
-        with gzip.open(table, "rt") as lines:
-            assert next(lines).startswith("method,variant,seed,data,category,split,sample,metric")
-        report = json.loads(
-            table.with_name(f"{table.name.removesuffix('.csv.gz')}.json").read_text()
-        )
-        assert report["digests"]["scores"] == sha256_file(table)
+    assert {name.removesuffix(".csv") + ".json" for name in tables} == set(files) - set(tables)
+    for name in tables:
+        lines = files[name].decode().splitlines()
+        assert [line.partition(",")[0] for line in lines] == COLUMNS
+        assert len({line.count(",") for line in lines if '"' not in line}) == 1

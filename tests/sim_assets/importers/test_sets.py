@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -105,13 +106,24 @@ def test_names_of_categories():
     assert our_category("..") == "models"
 
 
-@pytest.mark.parametrize("below", ["", "MDV02", "MDV02/oven", "MDV02/oven/0001", "MDV02/new"])
-@pytest.mark.parametrize("where", ["", "MDV02", "MDV02/oven", "MDV02/oven/0001"])
-def test_no_original_is_touched(where: str, below: str, tmp_path: Path):
+@pytest.fixture(scope="module")
+def ovens(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set with one oven, twice."""
+    folder = tmp_path_factory.mktemp("ovens")
     obj = generate("oven", "train", 3, 0)
-    source = tmp_path / "set"
-    foreign.shape2motion(obj, source, "oven")
-    foreign.shape2motion(obj, source, "oven", "0002")
+    for name in ("0001", "0002"):
+        foreign.shape2motion(obj, folder, "oven", name)
+    return folder
+
+
+@pytest.mark.parametrize("below", ["", "MDV02", "MDV02/oven", "MDV02/oven/0001", "MDV02/new"])
+@pytest.mark.parametrize(
+    "where",
+    ["", pytest.param("MDV02", marks=pytest.mark.slow), "MDV02/oven",
+     pytest.param("MDV02/oven/0001", marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_no_original_is_touched(where: str, below: str, ovens: Path, tmp_path: Path):
+    source = shutil.copytree(ovens, tmp_path / "set")
     top = source / "MDV02/oven"
     before = {path: path.read_bytes() for path in source.rglob("*") if path.is_file()}
     path, out = source / where, source / below
