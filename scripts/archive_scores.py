@@ -17,11 +17,12 @@ import csv
 import gzip
 import io
 import json
+import lzma
 import sys
 import tarfile
 from pathlib import Path
 
-from scapo.store.files import sha256_file
+from scapo.store.files import sha256_file, write_bytes
 
 
 def turned(table: str) -> str:
@@ -33,18 +34,28 @@ def turned(table: str) -> str:
 
 
 def pack(archive: Path, out: Path, pattern: str = "*") -> int:
-    """Archive tables and reports, and say how many tables."""
+    """Archive tables and reports, and say how many tables.
+
+    An archive that is there stays until the new one is whole.
+    """
     scores = sorted((out / "scores").rglob(f"{pattern}.csv.gz"))
-    with tarfile.open(archive, "w:xz", preset=9) as packed:
+    if not scores:
+        raise ValueError(f"{out}: expected scores/**/{pattern}.csv.gz, found none")
+    held = io.BytesIO()
+    with tarfile.open(fileobj=held, mode="w:xz", preset=9) as packed:
         for path in scores:
             table = gzip.decompress(path.read_bytes()).decode()
-            lying = turned(table)
+            try:
+                lying = turned(table)
+            except ValueError:  # rows of different lengths
+                lying = ""
             if turned(lying) != table:
                 raise ValueError(f"{path}: expected a table written by scapo-bench evaluate")
             report = path.with_name(path.name.removesuffix(".csv.gz") + ".json")
             name = path.relative_to(out).with_suffix("").as_posix()
             _add(packed, name, lying.encode())
             _add(packed, report.relative_to(out).as_posix(), report.read_bytes())
+    write_bytes(archive, held.getvalue())
     return len(scores)
 
 
@@ -56,9 +67,12 @@ def _add(packed: tarfile.TarFile, name: str, data: bytes) -> None:
 
 def restore(archive: Path, out: Path) -> int:
     """Unpack one archive and say how many tables it held."""
-    with tarfile.open(archive) as packed:
-        names = [out / name for name in packed.getnames() if name.endswith(".csv")]
-        packed.extractall(out, filter="data")
+    try:
+        with tarfile.open(archive, "r:xz") as packed:
+            names = [out / name for name in packed.getnames() if name.endswith(".csv")]
+            packed.extractall(out, filter="data")
+    except (EOFError, lzma.LZMAError, tarfile.TarError) as error:
+        raise ValueError(f"{archive}: {error}") from error
     for lying in names:
         scores = lying.with_name(f"{lying.name}.gz")
         with scores.open("wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as stream:
@@ -78,10 +92,13 @@ def main(words: list[str]) -> None:
             print(f"{archive}: {pack(Path(archive), Path(out), *pattern)} tables")
         case ["restore", out, *archives] if archives:
             for archive in archives:
-                print(f"{archive}: {restore(Path(archive), Path(out))} tables")
+                print(f"{archive}: {restore(Path(archive), Path(out))} tables", flush=True)
         case _:
             sys.exit(__doc__)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except (OSError, ValueError) as error:
+        sys.exit(f"archive_scores: {error}")

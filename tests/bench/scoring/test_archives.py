@@ -46,6 +46,26 @@ def test_scores_are_restored_to_the_byte(tmp_path: Path):
     assert said == {"summary": {"n": 2}, "digests": {"scores": sha256_file(back)}}
 
 
+def test_what_cannot_be_packed_or_restored_is_one_line_and_costs_no_archive(tmp_path: Path):
+    archive = tmp_path / "kept.tar.xz"
+    archive.write_bytes(b"what was there")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "torn/scores").mkdir(parents=True)
+    (tmp_path / "torn/scores/a.csv.gz").write_bytes(gzip.compress(b"method,seed\nicp,1\nicp\n"))
+    for words in (
+        ("pack", archive, tmp_path / "empty"),
+        ("pack", archive, tmp_path / "torn"),
+        ("restore", tmp_path / "out", archive),
+        ("restore", tmp_path / "out", tmp_path / "none.tar.xz"),
+    ):
+        found = subprocess.run([sys.executable, SCRIPT, *map(str, words)],
+                               capture_output=True, text=True, check=False)  # fmt: skip
+        assert found.returncode == 1
+        assert found.stderr.startswith("archive_scores: ")
+        assert found.stderr.count("\n") == 1
+    assert archive.read_bytes() == b"what was there"
+
+
 COLUMNS = [
     "method", "variant", "seed", "data", "category", "split", "sample", "metric",
     "slot", "value", "unit",
