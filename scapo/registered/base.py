@@ -413,7 +413,8 @@ class AbstractRegistered(AbstractMethod):
         plain = self._prediction(placement, part_weight, similarity, confidence)
         if not bool((self.pseudo.trust > 0).any()):  # not trained yet
             return plain
-        return replace(plain, joint_limits=metric_limits(self.template, self._limits(), similarity))
+        limits = metric_limits(self.template, self._limits(), placement, similarity)
+        return replace(plain, joint_limits=limits)
 
     def _camera(
         self, observation: Observation, similarity: Similarity, kept: Float[Tensor, "B K 3"]

@@ -28,7 +28,8 @@ def placed_prediction(
     """The prediction that a placement in normalised frames stands for.
 
     States and part frames are those from the template's own state, or where axes deviate from their
-    rest, so that every part is its base moved by its joint.
+    rest, so that every part is its base moved by its joint; what stretching turns a part by counts
+    as its state (`turned_by_stretching`).
 
     Args:
         template: The category's.
@@ -42,7 +43,8 @@ def placed_prediction(
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]
-    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state - template.rest)
+    turned = placement.state - _rest(template, placement)
+    state = torch.where(slides(template)[:, 0] > 0, metric, turned)
     shape, normals = canonical_surface(template, placement)
     part = template.logit.argmax(-1)
     return Prediction(
@@ -58,12 +60,43 @@ def placed_prediction(
 
 @torch.no_grad()
 def metric_limits(
-    template: ArticulatedTemplate, limits: JointLimits, similarity: Similarity
+    template: ArticulatedTemplate,
+    limits: JointLimits,
+    placement: Placement,
+    similarity: Similarity,
 ) -> Float[Tensor, "B J 2"]:
     """Joint limits in the units and from the zero of the predicted states."""
     ends = torch.stack([limits.low, limits.high], -1)
     metric = ends / similarity.scale[:, None, None]
-    return torch.where(slides(template) > 0, metric, ends - template.rest[:, None])
+    return torch.where(slides(template) > 0, metric, ends - _rest(template, placement)[..., None])
+
+
+@torch.no_grad()
+def turned_by_stretching(
+    template: ArticulatedTemplate, placement: Placement
+) -> Float[Tensor, "B J"]:
+    """How far each hinged part lies beyond its state because the object is stretched, rad.
+
+    A placement stretches the template along its base's directions before joints move. A door that
+    is half open in the template lies askew to these: stretched, it is sheared, and lies as its
+    points do, not as its state says. Of a shear the nearest rotation about the hinge counts
+    (Procrustes).
+    """
+    share, scale = template.logit.softmax(-1), placement.log_scale.exp()
+    turns = []
+    for j, axis in enumerate(template.directions()):
+        weight = share[:, j + 1, None] / share[:, j + 1].sum()
+        arm = template.points - (weight * template.points).sum(0)
+        moment = ((weight * arm).mT @ arm) * scale[:, None]  # (B, 3, 3): mean of x (S x)^T
+        curl = torch.stack([(moment - moment.mT)[:, k - 2, k - 1] for k in range(3)], -1)
+        along = (moment @ axis) @ axis
+        turns.append(torch.atan2(curl @ axis, moment.diagonal(dim1=1, dim2=2).sum(1) - along))
+    return torch.stack(turns, 1) * (1 - slides(template)[:, 0])
+
+
+def _rest(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B J"]:
+    """State of each joint at which the frames of its part and the base are the same."""
+    return template.rest - turned_by_stretching(template, placement)
 
 
 def part_frames(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
@@ -91,7 +124,7 @@ def _aside(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor,
 
 def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
     """The placement with axes that deviate at their rest, others at the template's own state."""
-    return replace(placement, state=template.rest.expand_as(placement.state))
+    return replace(placement, state=_rest(template, placement))
 
 
 @torch.no_grad()
