@@ -23,7 +23,7 @@ from scapo.pictures import PictureData
 from scapo.records import cat, map_tensors, take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import SearchConfig
-from scapo.registered.decode import metric_limits, nearest_weights
+from scapo.registered.decode import lying_rest, metric_limits, nearest_weights
 from scapo.registered.discovery import Discovery
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
@@ -245,11 +245,19 @@ class AbstractRegistered(AbstractMethod):
     def _prediction(
         self,
         placement: Placement,
+        rest: Float[Tensor, "B J"],
         part_weight: Float[Tensor, "B N P"],
         similarity: Similarity,
         confidence: Float[Tensor, " B"],
     ) -> Prediction:
-        """What a placement in normalised frames stands for."""
+        """What a placement in normalised frames stands for, its states counted from `rest`."""
+
+    def _rest(self, placement: Placement) -> Float[Tensor, "B J"]:
+        """States at which a part's frame is the base's: nobody knows at which the parts were made.
+
+        The template has them anywhere in their range, and stretches them as they lie there.
+        """
+        return lying_rest(self.template, placement)
 
     def _inlier_mask(self, cloud: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
         """Which points belong to the object; all where outliers are kept."""
@@ -410,10 +418,11 @@ class AbstractRegistered(AbstractMethod):
         confidence: Float[Tensor, " B"],
     ) -> Prediction:
         """`_prediction`, with the states that were seen in training as limits."""
-        plain = self._prediction(placement, part_weight, similarity, confidence)
+        rest = self._rest(placement)
+        plain = self._prediction(placement, rest, part_weight, similarity, confidence)
         if not bool((self.pseudo.trust > 0).any()):  # not trained yet
             return plain
-        limits = metric_limits(self.template, self._limits(), placement, similarity)
+        limits = metric_limits(self.template, self._limits(), rest, similarity)
         return replace(plain, joint_limits=limits)
 
     def _camera(

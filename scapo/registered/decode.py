@@ -21,31 +21,30 @@ from scapo.types import Joints, Prediction
 def placed_prediction(
     template: ArticulatedTemplate,
     placement: Placement,
+    rest: Float[Tensor, "B J"],
     part_weight: Float[Tensor, "B N P"],
     similarity: Similarity,
     confidence: Float[Tensor, " B"],
 ) -> Prediction:
     """The prediction that a placement in normalised frames stands for.
 
-    States and part frames are those from the template's own state, or where axes deviate from their
-    rest, so that every part is its base moved by its joint; what stretching turns a part by counts
-    as its state (`turned_by_stretching`).
+    States count from `rest`, so that every part is its base moved by its joint.
 
     Args:
         template: The category's.
         placement: Of each cloud.
+        rest: States at which the frames of a part and the base are the same (`lying_rest`).
         part_weight: Of the points.
         similarity: The normalisation to undo.
         confidence: Handed on.
     """
-    poses = part_frames(template, placement)
+    poses = part_frames(template, placement, rest)
     origin = template.part_centres()[0] * placement.log_scale.exp()
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]
-    turned = placement.state - _rest(template, placement)
-    state = torch.where(slides(template)[:, 0] > 0, metric, turned)
-    shape, normals = canonical_surface(template, placement)
+    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state - rest)
+    shape, normals = canonical_surface(template, placement, rest)
     part = template.logit.argmax(-1)
     return Prediction(
         part_weight=part_weight,
@@ -62,25 +61,23 @@ def placed_prediction(
 def metric_limits(
     template: ArticulatedTemplate,
     limits: JointLimits,
-    placement: Placement,
+    rest: Float[Tensor, "B J"],
     similarity: Similarity,
 ) -> Float[Tensor, "B J 2"]:
     """Joint limits in the units and from the zero of the predicted states."""
     ends = torch.stack([limits.low, limits.high], -1)
     metric = ends / similarity.scale[:, None, None]
-    return torch.where(slides(template) > 0, metric, ends - _rest(template, placement)[..., None])
+    return torch.where(slides(template) > 0, metric, ends - rest[..., None])
 
 
 @torch.no_grad()
-def turned_by_stretching(
-    template: ArticulatedTemplate, placement: Placement
-) -> Float[Tensor, "B J"]:
-    """How far each hinged part lies beyond its state because the object is stretched, rad.
+def lying_rest(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B J"]:
+    """States from which hinged parts have turned as far as they lie turned, rad.
 
     A placement stretches the template along its base's directions before joints move. A door that
     is half open in the template lies askew to these: stretched, it is sheared, and lies as its
-    points do, not as its state says. Of a shear the nearest rotation about the hinge counts
-    (Procrustes).
+    points do, not as its state says. Of the shear the nearest rotation about the hinge (Procrustes)
+    counts as the state's; what is left is the template's own rest.
     """
     share, scale = template.logit.softmax(-1), placement.log_scale.exp()
     turns = []
@@ -91,21 +88,18 @@ def turned_by_stretching(
         curl = torch.stack([(moment - moment.mT)[:, k - 2, k - 1] for k in range(3)], -1)
         along = (moment @ axis) @ axis
         turns.append(torch.atan2(curl @ axis, moment.diagonal(dim1=1, dim2=2).sum(1) - along))
-    return torch.stack(turns, 1) * (1 - slides(template)[:, 0])
+    return template.rest - torch.stack(turns, 1) * (1 - slides(template)[:, 0])
 
 
-def _rest(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor, "B J"]:
-    """State of each joint at which the frames of its part and the base are the same."""
-    return template.rest - turned_by_stretching(template, placement)
-
-
-def part_frames(template: ArticulatedTemplate, placement: Placement) -> PartPoses:
-    """view_T_part with frames that all parts share with the base when joints are at their rest.
+def part_frames(
+    template: ArticulatedTemplate, placement: Placement, rest: Float[Tensor, "B J"]
+) -> PartPoses:
+    """view_T_part with frames that all parts share with the base when joints are at `rest`.
 
     Where a joint sits on the body moves its part, not that frame.
     """
     poses = template.part_poses(placement)
-    rested = template.part_poses(_at_rest(template, placement))
+    rested = template.part_poses(replace(placement, state=rest))
     turn = poses.rotation @ rested.rotation.mT
     gap = placement.translation[:, None] - rested.translation
     aside = F.pad(_aside(template, placement), (0, 0, 1, 0)) @ placement.rotation.mT
@@ -122,20 +116,15 @@ def _aside(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor,
     return (placement.pivot - template.pivots(placement)) * (1 - slides(template))
 
 
-def _at_rest(template: ArticulatedTemplate, placement: Placement) -> Placement:
-    """The placement with axes that deviate at their rest, others at the template's own state."""
-    return replace(placement, state=_rest(template, placement))
-
-
 @torch.no_grad()
 def canonical_surface(
-    template: ArticulatedTemplate, placement: Placement
+    template: ArticulatedTemplate, placement: Placement, rest: Float[Tensor, "B J"]
 ) -> tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]]:
-    """Points and normals of the template in each cloud's size, at the state that counts as 0.
+    """Points and normals of the template in each cloud's size, at the states `rest`, which are 0.
 
     They are in the template's frame. Moved by its joint, each part lies as it is placed.
     """
-    still = _at_rest(template, placement)
+    still = replace(placement, state=rest)
     own, aside = placement.rotation[:, None], _aside(template, placement)
     rested, turned = (template.part_poses(some).rotation[:, 1:] for some in (still, placement))
     returned = (own.mT @ rested @ turned.mT @ own @ aside[..., None])[..., 0]

@@ -102,21 +102,28 @@ class LabelledRegistered(AbstractRegistered):
         logger.info("template of true placements: mean loss %.3f", float(made.found.loss.mean()))
         return made
 
+    def _rest(self, placement: Placement) -> Float[Tensor, "B J"]:
+        """The template's own: it is the mean of the objects as they are made, and stretches so."""
+        return self.template.rest.expand_as(placement.state)
+
     def _prediction(
         self,
         placement: Placement,
+        rest: Float[Tensor, "B J"],
         part_weight: Float[Tensor, "B N P"],
         similarity: Similarity,
         confidence: Float[Tensor, " B"],
     ) -> Prediction:
         """Part frames are the object's at rest."""
-        plain = placed_prediction(self.template, placement, part_weight, similarity, confidence)
-        poses = part_frames(self.template, placement)
+        plain = placed_prediction(
+            self.template, placement, rest, part_weight, similarity, confidence
+        )
+        poses = part_frames(self.template, placement, rest)
         scale = similarity.scale[:, None, None]
         return replace(
             plain,
             camera_T_part=similarity.inverse_pose(rigid(poses.rotation, poses.translation)),
-            canonical_points=canonical_surface(self.template, placement)[0] / scale,
+            canonical_points=canonical_surface(self.template, placement, rest)[0] / scale,
         )
 
 

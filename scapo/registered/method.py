@@ -258,12 +258,15 @@ class TemplateRegistration(AbstractRegistered):
     def _prediction(
         self,
         placement: Placement,
+        rest: Float[Tensor, "B J"],
         part_weight: Float[Tensor, "B N P"],
         similarity: Similarity,
         confidence: Float[Tensor, " B"],
     ) -> Prediction:
         """Part frames sit at the middle of the template's base."""
-        return placed_prediction(self.template, placement, part_weight, similarity, confidence)
+        return placed_prediction(
+            self.template, placement, rest, part_weight, similarity, confidence
+        )
 
 
 def load_run(name: str | Path, category: Category) -> TemplateRegistration:

@@ -72,7 +72,8 @@ class Told(AbstractMethod):
         normals = surface_normals(points, points, camera)
         weight = nearest_weights(self.template, points, normals, placement)
         sure = torch.tensor([0.1 if int(r) in self.wrong else 0.9 for r in row])
-        return placed_prediction(self.template, placement, weight, similarity, sure)
+        rest = torch.zeros_like(placement.state)
+        return placed_prediction(self.template, placement, rest, weight, similarity, sure)
 
     @property
     def variant(self) -> str:

@@ -15,10 +15,10 @@ from scapo.geometry.rigid import apply, invert, joint_motion, random_rotations
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.registered.decode import (
     canonical_surface,
+    lying_rest,
     metric_limits,
     nearest_weights,
     placed_prediction,
-    turned_by_stretching,
 )
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.template import ArticulatedTemplate, Placement
@@ -72,17 +72,16 @@ def test_parts_and_joint_of_a_prediction_belong_together(
     if own_hinges:
         elsewhere = torch.tensor([0.07, -0.02, 0.05])
         placement = replace(placement, pivot=shape.pivots(placement) + elsewhere)
-    weight = torch.full((3, 50, 2), 0.5)
-    found = placed_prediction(shape, placement, weight, similarity, torch.ones(3))
+    weight, rest = torch.full((3, 50, 2), 0.5), lying_rest(shape, placement)
+    found = placed_prediction(shape, placement, rest, weight, similarity, torch.ones(3))
     assert found.camera_T_part is not None
     assert found.joints is not None
     base, lid = found.camera_T_part.unbind(1)
     motion = joint_motion(
         found.joints.pivot[:, 0], found.joints.axis[:, 0], found.joints.state[:, 0], "revolute"
     )
-    turned = turned_by_stretching(shape, placement)
-    assert bool((turned.abs() > 1e-3).any()) == stretched
-    assert_close(found.joints.state, state - shape.rest + turned)
+    assert bool(((rest - shape.rest).abs() > 1e-3).any()) == stretched
+    assert_close(found.joints.state, state - rest)
     assert_close(lid, motion @ base, atol=1e-4, rtol=0)
     centre = apply(base, shape.part_centres()[0].expand(3, 1, 3) * 0)
     expected = similarity.inverse(
@@ -102,7 +101,7 @@ def test_parts_and_joint_of_a_prediction_belong_together(
     body = found.canonical_part[0] == 0
     assert_close(facing[:, body], shape.place(placement)[1][:, body], atol=2e-3, rtol=0)
     assert (found.canonical_part == shape.logit.argmax(-1)).all()
-    still = canonical_surface(shape, placement)[0] / size[:, None]
+    still = canonical_surface(shape, placement, rest)[0] / size[:, None]
     assert_close(still[0, body], still[2, body], atol=2e-4, rtol=0)  # parts are blended a little
 
 
@@ -114,13 +113,12 @@ def test_a_part_is_posed_as_it_lies_where_the_object_is_stretched(angle: float):
     placement = replace(still, log_scale=torch.tensor(SIZES).log().expand(3, 3))
     # The flap is a plate from its hinge towards -x: where that goes, by trigonometry.
     lies = math.atan2(SIZES[2] * math.sin(angle), SIZES[0] * math.cos(angle))
-    assert_close(
-        turned_by_stretching(shape, placement), torch.full((3, 1), lies - angle), atol=0.02, rtol=0
-    )
-    assert not turned_by_stretching(shape, still).abs().max() > 1e-6
+    rest = lying_rest(shape, placement)
+    assert_close(rest, torch.full((3, 1), angle - lies), atol=0.02, rtol=0)
+    assert not lying_rest(shape, still).abs().max() > 1e-6
     _, similarity = normalise(torch.randn(3, 50, 3, generator=generator(0)))
     weight = torch.full((3, 50, 2), 0.5)
-    found = placed_prediction(shape, placement, weight, similarity, torch.ones(3))
+    found = placed_prediction(shape, placement, rest, weight, similarity, torch.ones(3))
     assert found.camera_T_part is not None
     closed = found.camera_T_part[:, 1, :3, :3] @ rotvec_to_rotmat(angle * AXIS)
     flap = shape.logit.argmax(-1) == 1
@@ -144,10 +142,9 @@ def test_limits_are_in_the_units_and_from_the_zero_of_the_states():
     state = torch.linspace(0.2, 1.2, 101)[:, None]
     _, similarity = normalise(torch.randn(2, 50, 3, generator=generator(0)) * 3)
     turning, sliding = ArticulatedTemplate(("revolute",)), ArticulatedTemplate(("prismatic",))
-    turning.rest.fill_(0.5)
-    placed = Placement.at(torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3), torch.zeros(2, 1))
-    found = metric_limits(turning, limits_of(state, ("revolute",)), placed, similarity)
+    rest = torch.full((2, 1), 0.5)
+    found = metric_limits(turning, limits_of(state, ("revolute",)), rest, similarity)
     assert_close(found, torch.tensor([[[-0.28, 0.68]]]).expand(2, 1, 2), atol=1e-5, rtol=0)
-    found = metric_limits(sliding, limits_of(state, ("prismatic",)), placed, similarity)
+    found = metric_limits(sliding, limits_of(state, ("prismatic",)), rest, similarity)
     wanted = torch.tensor([0.22, 1.18]) / similarity.scale[:, None]
     assert_close(found[:, 0], wanted, atol=1e-5, rtol=1e-5)
