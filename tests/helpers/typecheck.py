@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from beartype import BeartypeConf, beartype
 
-CALLS = 8
+CALLS = 2
 CURRENT = "PYTEST_CURRENT_TEST"
 """Set by pytest: the test, and whether it is its setup, its call or its teardown."""
 _building = Lock()
