@@ -94,13 +94,13 @@ def with_axis_deviation(
 ) -> Candidate:
     """The start, or one whose axes deviate where that explains held-out views far better.
 
-    The pull of axes to the template's frame ends here: it was to keep hinges that deviate to either
-    side from being explained by an axis that deviates to a third.
+    The pull of axes to the template's frame goes on: objects deviate to either side of it, and what
+    their middle is the views leave open.
     """
     template, inliers = start.template, start.inliers
     if "revolute" not in template.kinds:
         return start
-    options = replace(late_options(template, config), axis_weight=0.0)
+    options = late_options(template, config)
     tried = [start, *deviating_templates(start, options, generator, journal)]
     if len(tried) == 1:
         return start

@@ -76,6 +76,8 @@ LAST_RATE = 0.01  # Share of the learning rate at the end
 PLACED, KEPT = 50, 250  # Clouds that are placed at a time, and after which what was found is kept
 PLACING, LATE = 0.08, 0.8
 """Seconds of one core for each of them, and the share of the start that is over before."""
+BETTER = 0.03
+"""Loss by which a hypothesis of the banks has to explain a view better than the network's own."""
 ROOM = 0.2  # Share of the inliers' range beyond which `refine` searches states
 
 
@@ -463,7 +465,10 @@ class AbstractRegistered(AbstractMethod):
         config, learned = self.config, self._has_learned()
         if refine:
             found = self._settled(seen, said, config.grid_hypotheses, THOROUGH)
-            return found if said is None else found.with_others(self._settled(seen, said, 0, OWN))
+            if said is None:
+                return found
+            charged = replace(found, unlike=found.unlike + BETTER)
+            return charged.with_others(self._settled(seen, said, 0, OWN))
         alone = learned and seen.up is None  # what the network had upside down is looked for
         beside = config.quick_beside if alone else config.quick_hypotheses
         return self._settled(seen, said, beside, BRIEF if beside else ALONE)

@@ -18,7 +18,9 @@ from scapo.registered import base
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.decode import nearest_weights
+from scapo.registered.learning import Said, SeenClouds
 from scapo.registered.method import TemplateRegistration
+from scapo.registered.pose_search import Effort, Hypotheses
 from scapo.registered.pseudo_labels import Candidates
 from scapo.registered.template import Placement
 from scapo.registered.view_bank import ShownPoints
@@ -150,6 +152,26 @@ def test_the_network_is_asked_where_it_learned_and_the_banks_where_not():
     plain, quick = (method.predict(observation, mode) for mode in ("fast", "quick"))
     assert_close(plain.part_weight, quick.part_weight)
     assert not torch.allclose(plain.part_weight, found.part_weight, atol=1e-3)
+
+
+@pytest.mark.parametrize(("loss", "first"), [(0.28, False), (0.26, True)])
+def test_refine_leaves_the_word_of_the_network_for_what_is_clearly_better(
+    loss: float, first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method, observation = trained(0)
+    _, truth = sighted(12, seed=60)
+    turned = replace(truth, rotation=truth.rotation @ random_rotations(1, generator(3))[0])
+
+    def settled(seen: SeenClouds, said: Said | None, beside: int, by: Effort) -> Hypotheses:
+        del seen, said, by
+        placement, cost = (turned, loss) if beside else (truth, 0.3)
+        none = torch.zeros(12, 1)
+        return Hypotheses(placement=placement, loss=none + cost, unlike=none)
+
+    monkeypatch.setattr(method, "_settled", settled)
+    seen = method._seen(observation)
+    found = method._hypotheses(seen, method._said(seen), refine=True).best(method._limits())
+    assert_close(found.placement.rotation, (turned if first else truth).rotation)
 
 
 def test_where_nobody_knows_the_camera_another_network_is_asked():
