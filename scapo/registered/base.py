@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from scapo.categories import Category, JointKind
@@ -33,6 +33,7 @@ from scapo.registered.learning import (
     candidates,
     dissent,
     hinged_as,
+    learned_row,
     taught,
     taught_in_principal_frames,
     undeviated,
@@ -294,24 +295,12 @@ class AbstractRegistered(AbstractMethod):
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`learning`)."""
         del labels
-        clouds, count = (observation.points, self._learned_row(step)), self.config.points
+        clouds, count = (observation.points, learned_row(step, self._taught())), self.config.points
         if isinstance(self.network, ViewNetwork):
             return taught(self.network, self.template, self.targets, clouds, count, step.generator)
         return taught_in_principal_frames(
             self.network, self.template, self.pseudo, clouds, count, step.generator
         )
-
-    def _learned_row(self, step: Step) -> Int[Tensor, " B"]:
-        """Which of the learned clouds a batch holds.
-
-        Raises:
-            ValueError: A cloud whose placement was not searched for.
-        """
-        learned = evenly(step.total, self._taught()).to(step.index.device)
-        row = torch.searchsorted(learned, step.index).clamp(max=len(learned) - 1)
-        if bool((learned[row] != step.index).any()):
-            raise ValueError("expected clouds whose placements were found, found others")
-        return row
 
     def pictures(self, observation: Observation, stage: str) -> dict[str, PictureData]:
         """The template over its states, and where the network places it."""

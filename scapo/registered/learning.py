@@ -18,6 +18,7 @@ from torch import Tensor
 from scapo.geometry.points import Similarity, farthest_points, gather, k_nearest, nearest, normalise
 from scapo.geometry.rigid import rotation_angle
 from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.method import Step, evenly
 from scapo.records import cat, map_tensors, take
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.decode import nearest_weights
@@ -81,6 +82,19 @@ class SeenClouds:
         if not bool(self.inlier.all()):  # outliers have normals of their own
             normals = surface_normals(self.points, self.points, self.views.camera)
         return nearest_weights(template, self.points, normals, placement)
+
+
+def learned_row(step: Step, count: int) -> Int[Tensor, " B"]:
+    """Which of so many learned clouds, evenly spread over the training, a batch holds.
+
+    Raises:
+        ValueError: A cloud whose placement was not searched for.
+    """
+    learned = evenly(step.total, count).to(step.index.device)
+    row = torch.searchsorted(learned, step.index).clamp(max=len(learned) - 1)
+    if bool((learned[row] != step.index).any()):
+        raise ValueError("expected clouds whose placements were found, found others")
+    return row
 
 
 @torch.no_grad()

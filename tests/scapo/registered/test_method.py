@@ -18,7 +18,7 @@ from scapo.registered import base
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.decode import nearest_weights
-from scapo.registered.learning import Said, SeenClouds
+from scapo.registered.learning import Said, SeenClouds, learned_row
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.pose_search import Effort, Hypotheses
 from scapo.registered.pseudo_labels import Candidates
@@ -277,7 +277,7 @@ def test_of_many_clouds_only_the_learned_ones_have_placements():
     few.load_state_dict(method.state_dict())  # of 12 clouds, 0, 5 and 11 are learned
     row = torch.tensor([11, 0])
     batch = Observation(points=observation.points[row])
-    assert few._learned_row(at(0.0, row, generator(0))).tolist() == [2, 0]
+    assert learned_row(at(0.0, row, generator(0)), 3).tolist() == [2, 0]
     with pytest.raises(ValueError, match="expected clouds whose placements were found"):
         few.losses(batch, Labels(), at(0.0, row - 1, generator(0)))
 
