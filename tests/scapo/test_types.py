@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
 from scapo import categories, types
