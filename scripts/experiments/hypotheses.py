@@ -111,9 +111,9 @@ def main(run: Path, data: Path, count: int, picture: Path | None) -> None:
         answer, spent = predicted(method, val, mode)
         wrong = errors(category, answer, truth, offsets, lengths(val))
         base, turned = wrong["part_rotation"][:, 0], wrong["part_rotation"]
-        rows.append((number, 100 * np.mean(base < RIGHT), spent))
+        rows.append((number, float(np.nanmean(turned)), spent))
         print(
-            f"| {name} | {rows[-1][1]:.1f} | {100 * np.mean(base > TURNED):.1f} "
+            f"| {name} | {100 * np.mean(base < RIGHT):.1f} | {100 * np.mean(base > TURNED):.1f} "
             f"| {100 * np.nanmean(wrong['iou']):.1f} | {np.nanmean(wrong['joint_direction']):.1f} "
             f"| {np.nanmean(turned):.1f} | {np.nanmedian(turned):.1f} | {spent:.1f} |",
             flush=True,
@@ -123,16 +123,18 @@ def main(run: Path, data: Path, count: int, picture: Path | None) -> None:
 
 
 def draw(rows: list[tuple[int, float, float]], category: str, picture: Path) -> None:
-    """The curve: share of right bases against milliseconds."""
+    """The curve: rotation of the parts against milliseconds."""
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(figsize=(5, 3.5), layout="constrained")
     quick = [row for row in rows if row[0]]
     axes.plot([row[2] for row in quick], [row[1] for row in quick], "o-", label="quick")
-    for number, share, spent in quick:
-        axes.annotate(str(number), (spent, share), textcoords="offset points", xytext=(4, -10))
+    for number, angle, spent in quick:
+        axes.annotate(str(number), (spent, angle), textcoords="offset points", xytext=(4, -10))
     axes.plot(*[[row[k] for row in rows if not row[0]] for k in (2, 1)], "s", label="refine")
-    axes.set(xlabel="ms of one core for each cloud", ylabel="bases within 30°, %", title=category)
+    axes.set(
+        xlabel="ms of one core for each cloud", ylabel="R, degrees", ylim=(0, None), title=category
+    )
     axes.legend()
     figure.savefig(picture, dpi=150)
 
