@@ -22,6 +22,17 @@ def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     return roma.rotvec_to_rotmat(vector)
 
 
+def turns_about(axis: Float[Tensor, " 3"], angle: Float[Tensor, " B"]) -> Float[Tensor, "B 3 3"]:
+    """Rotations about one unit axis (Rodrigues), in a few steps: models turn parts all the time.
+
+    >>> turns_about(torch.tensor([0.0, 0, 1]), torch.tensor([torch.pi / 2]))[0, :, 0].round()
+    tensor([0., 1., 0.])
+    """
+    across = torch.linalg.cross(axis.expand(3, 3), torch.eye(3).to(axis)).mT  # x -> axis x x
+    sine, cosine = angle.sin()[:, None, None], angle.cos()[:, None, None]
+    return torch.eye(3).to(axis) + sine * across + (1 - cosine) * (across @ across)
+
+
 def rotmat_to_rotvec(rotation: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3"]:
     """Its inverse, of at most half a turn."""
     import roma

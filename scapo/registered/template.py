@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from scapo.categories import JointKind
 from scapo.geometry.points import farthest_points
-from scapo.geometry.rotations import rotvec_to_rotmat
+from scapo.geometry.rotations import rotvec_to_rotmat, turns_about
 from scapo.records import cat, take
 
 SPAN = (0.02, 0.98)
@@ -154,7 +154,7 @@ class ArticulatedTemplate(nn.Module):
         """How hinge j turns its part: from its rest about its own axis (`axis_deviation`)."""
         axis, state = self.directions()[j], placement.state[:, j : j + 1]
         if not bool(placement.deviation[:, j].any()):
-            return rotvec_to_rotmat(axis * state)
+            return turns_about(axis, state[:, 0])
         aside = rotvec_to_rotmat(placement.deviation[:, j])
         onward = rotvec_to_rotmat(axis * (state - self.rest[j]))
         return aside @ onward @ aside.mT @ rotvec_to_rotmat(axis * self.rest[j])
@@ -213,7 +213,9 @@ class ArticulatedTemplate(nn.Module):
 
         A sliding joint has no pivot of its own: the middle of its part stands for it.
         """
-        pivot = torch.where(slides(self) > 0, self.part_centres()[1:], self.pivot)
+        pivot: Tensor = self.pivot
+        if "prismatic" in self.kinds:
+            pivot = torch.where(slides(self) > 0, self.part_centres()[1:], pivot)
         return pivot * placement.log_scale.exp()[:, None] + placement.shift
 
     def joints_in_view(

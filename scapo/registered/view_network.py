@@ -239,11 +239,14 @@ def placed_by_votes(
         template: Whose joints link the parts.
     """
     share = votes.part.softmax(-1)
-    fitted = [_fitted(points, votes.points[:, :, p], share[..., p]) for p in range(share.shape[-1])]
-    rotation, translation, off = fitted[0]
+    every = share.shape[-1]  # Parts: the steps of all are taken at once, for they are small
+    whole = points.repeat(every, 1, 1)
+    own, mine = votes.points.movedim(2, 0).flatten(0, 1), share.movedim(2, 0).flatten(0, 1)
+    turns, moves, offs = (x.unflatten(0, (every, -1)) for x in _fitted(whole, own, mine))
+    rotation, translation, off = turns[0], moves[0], offs[0]
     states = []
     for j, kind in enumerate(template.kinds):
-        turn, move, _ = fitted[j + 1]
+        turn, move = turns[j + 1], moves[j + 1]
         axis = template.directions()[j]
         if kind == "prismatic":
             apart = (rotation.mT @ (move - translation)[..., None])[..., 0]

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.geometry import rigid as geometry
-from scapo.geometry.rotations import FEW, special_procrustes
+from scapo.geometry.rotations import FEW, special_procrustes, turns_about
 from tests.helpers.strategies import (
     batch_shapes,
     generator,
@@ -32,6 +32,17 @@ quick = settings(max_examples=15, deadline=None)
 def about_x(angle: float, dtype: torch.dtype = torch.float64) -> Tensor:
     """Rotation about x by an angle computed in double precision."""
     return torch.from_numpy(Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix()).to(dtype)
+
+
+@quick
+@given(seed=seeds, angle=st.floats(-7.0, 7.0))
+def test_turns_about_an_axis_match_scipy(seed: int, angle: float) -> None:
+    axis = unit_vectors(seed)
+    expected = Rotation.from_rotvec(angle * axis.numpy()).as_matrix()
+    angles = torch.tensor([angle, 0.0], dtype=torch.float64)
+    found = turns_about(axis, angles)
+    assert_close(found[0], torch.from_numpy(expected), atol=1e-12, rtol=0)
+    assert_close(found[1], torch.eye(3, dtype=torch.float64), atol=0, rtol=0)
 
 
 @quick
