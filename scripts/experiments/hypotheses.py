@@ -136,7 +136,7 @@ def draw(rows: list[tuple[int, float, float]], category: str, picture: Path) -> 
         xlabel="ms of one core for each cloud", ylabel="R, degrees", ylim=(0, None), title=category
     )
     axes.legend()
-    figure.savefig(picture, dpi=150)
+    figure.savefig(picture, dpi=100)
 
 
 if __name__ == "__main__":
