@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: MIT
 """What each thing that template registration takes for granted is worth, at test time.
 
-    python scripts/experiments/priors.py MODEL DATA [CLOUDS [MODE]]
+    python scripts/experiments/priors.py MODEL DATA [CLOUDS [MODE [NAME ...]]]
 
-Asks a released model of so many clouds of `val`, evenly spread, as it is and without
-one prior at a time, and once told which way is up; the evaluator's means are printed, part order
-per sample, in the object's frame. What a prior is worth in training is another question.
+Asks a released model of so many clouds of `val`, evenly spread, as it is and without one prior at a
+time, and once told which way is up (with names, as it is and those alone); the evaluator's means
+are printed, part order per sample, in the object's frame. What a prior is worth in training is
+another question.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from torch import Tensor
 from bench.requests import EvaluateRequest, Mode, PredictRequest
 from bench.runs import predict as asking
 from bench.scoring.evaluate import evaluate
-from scapo.registered import pose_refinement, view_loss
+from scapo.registered import base, pose_refinement, view_loss
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.pose_search import SearchSpace, light, modes_of
 from scapo.registered.view_bank import ViewBank
@@ -81,6 +82,11 @@ def without_hinges(method: TemplateRegistration) -> None:
     method.network.get_buffer("hinged").zero_()
 
 
+def as_states_say(method: TemplateRegistration) -> None:
+    """Parts posed as if stretching turned none of them."""
+    method._rest = lambda placement: method.template.rest.expand_as(placement.state)
+
+
 CHANGES: dict[str, Change | None] = {
     "as it is": None,
     "known up": None,
@@ -93,7 +99,12 @@ CHANGES: dict[str, Change | None] = {
     "no free space, nothing unseen": None,
     "axes of the category": without_axes,
     "hinges of the template": without_hinges,
+    "parts as their states say": as_states_say,
+    "banks better by any loss": None,
+    "banks never better": None,
 }
+MARGINS = {"banks better by any loss": 0.0, "banks never better": 100.0}
+"""Loss by which `refine` wants another hypothesis to be better than the network's."""
 
 
 def scores(run: Path, data: Path, count: int, mode: Mode, name: str) -> list[float]:
@@ -112,6 +123,7 @@ def scores(run: Path, data: Path, count: int, mode: Mode, name: str) -> list[flo
     seen = pose_refinement.should_be_seen
     if name.startswith("no free space"):
         pose_refinement.should_be_seen = view_loss.should_be_seen = nothing_seen
+    usually, base.BETTER = base.BETTER, MARGINS.get(name, base.BETTER)
     asking.load = load
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -126,16 +138,18 @@ def scores(run: Path, data: Path, count: int, mode: Mode, name: str) -> list[flo
                 )
             )  # fmt: skip
     finally:
-        asking.load = usual
+        asking.load, base.BETTER = usual, usually
         pose_refinement.should_be_seen = view_loss.should_be_seen = seen
     return [factor * found["summary"][key]["mean"] for key, factor in COLUMNS.items()]
 
 
-def main(run: Path, data: Path, count: int, mode: Mode) -> None:
-    """Print a row for each."""
+def main(run: Path, data: Path, count: int, mode: Mode, names: list[str]) -> None:
+    """Print a row for each, or for those that are named."""
+    if unknown := [name for name in names if name not in CHANGES]:
+        sys.exit(f"names: expected some of {', '.join(CHANGES)}, found {', '.join(unknown)}")
     torch.set_num_threads(1)
     print(f"{run.stem}, {mode}, {count} clouds: S, D, C, R, t")
-    for name in CHANGES:
+    for name in ["as it is", *names] if names else CHANGES:
         try:
             found = scores(run, data, count, mode, name)
         except ValueError as error:
@@ -149,5 +163,5 @@ if __name__ == "__main__":
     words = sys.argv[3:]
     main(
         Path(sys.argv[1]), Path(sys.argv[2]), int(words[0]) if words else 100,
-        "quick" if words[1:] == ["quick"] else "refine",
+        "quick" if words[1:2] == ["quick"] else "refine", words[2:],
     )  # fmt: skip
