@@ -101,10 +101,9 @@ class AbstractRegistered(AbstractMethod):
         kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         self.template = ArticulatedTemplate(kinds, config.discovery.final_points)
         sizes = (len(category.parts), len(kinds))
-        known = config.camera == "known"
         self.network = (
             ViewNetwork(*sizes, channels=config.channels)
-            if known
+            if config.camera == "known"
             else PointVotes(*sizes, width=config.width)
         )
         initialise(self.network, generator)
@@ -119,17 +118,18 @@ class AbstractRegistered(AbstractMethod):
     def stages(self) -> tuple[Stage, ...]:
         """The network's rounds; the template is found before the first."""
         rounds = self.config.rounds if self.config.camera == "known" else 1
+        names = [FIRST, *(f"round-{k + 1}" for k in range(1, rounds))]
         return tuple(
             Stage(
                 name=name,
-                epochs=self.config.epochs,
+                epochs=-(-self.config.epochs // (1 if name == names[-1] else 2)),
                 lr=self.config.lr,
                 min_lr=self.config.lr * LAST_RATE,
                 batch=self.config.batch,
                 clouds=self._taught(),
                 parameters=(ParameterGroup(module="network"),),
             )
-            for name in [FIRST, *(f"round-{k + 1}" for k in range(1, rounds))]
+            for name in names
         )
 
     def _taught(self) -> int:

@@ -192,12 +192,11 @@ def _base_columns(
     turned = by_turn(arm.flatten(1, 2)).unflatten(1, arm.shape[1:3])
     moved = torch.zeros_like(turned)
     moved[:, :, 3] = torch.eye(3).to(arm)
-    scaled = torch.zeros_like(turned)
-    for axis in range(3):
-        scaled[:, :, axis, :, axis] = affine[:, :, axis]
-        for p, pivot in enumerate(template.pivot, 1):  # the pivot grows with the body
-            gap = affine[:, 0, axis] - affine[:, p, axis]
-            scaled[:, p, 3, :, axis] = gap * pivot[axis]
+    linear = affine[:, :, :3]
+    stretched = linear[..., None] * torch.eye(3).to(arm)[:, None]
+    pivot = F.pad(template.pivot, (0, 0, 1, 0))[..., None]  # it grows with the body
+    carried = ((linear[:, :1] - linear) * pivot).mT[:, :, None]
+    scaled = torch.cat([stretched, carried], 2)
     return torch.cat([turned, moved, scaled], -1)
 
 

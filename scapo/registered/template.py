@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from scapo.categories import JointKind
 from scapo.geometry.points import farthest_points
-from scapo.geometry.rotations import rotvec_to_rotmat, turns_about
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
 
 SPAN = (0.02, 0.98)
@@ -154,7 +154,7 @@ class ArticulatedTemplate(nn.Module):
         """How hinge j turns its part: from its rest about its own axis (`axis_deviation`)."""
         axis, state = self.directions()[j], placement.state[:, j : j + 1]
         if not bool(placement.deviation[:, j].any()):
-            return turns_about(axis, state[:, 0])
+            return rotvec_to_rotmat(axis * state)
         aside = rotvec_to_rotmat(placement.deviation[:, j])
         onward = rotvec_to_rotmat(axis * (state - self.rest[j]))
         return aside @ onward @ aside.mT @ rotvec_to_rotmat(axis * self.rest[j])

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.geometry import rigid as geometry
-from scapo.geometry.rotations import FEW, special_procrustes, turns_about
+from scapo.geometry.rotations import FEW, rotvec_to_rotmat, special_procrustes
 from tests.helpers.strategies import (
     batch_shapes,
     generator,
@@ -36,13 +36,23 @@ def about_x(angle: float, dtype: torch.dtype = torch.float64) -> Tensor:
 
 @quick
 @given(seed=seeds, angle=st.floats(-7.0, 7.0))
-def test_turns_about_an_axis_match_scipy(seed: int, angle: float) -> None:
-    axis = unit_vectors(seed)
-    expected = Rotation.from_rotvec(angle * axis.numpy()).as_matrix()
-    angles = torch.tensor([angle, 0.0], dtype=torch.float64)
-    found = turns_about(axis, angles)
-    assert_close(found[0], torch.from_numpy(expected), atol=1e-12, rtol=0)
-    assert_close(found[1], torch.eye(3, dtype=torch.float64), atol=0, rtol=0)
+def test_rotvec_to_rotmat_matches_scipy(seed: int, angle: float) -> None:
+    vector = torch.stack([angle * unit_vectors(seed), torch.zeros(3, dtype=torch.float64)])
+    expected = torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix())
+    assert_close(rotvec_to_rotmat(vector), expected, atol=1e-12, rtol=0)
+    assert_close(rotvec_to_rotmat(vector[:, None])[:, 0], expected, atol=1e-12, rtol=0)
+    assert_close(rotvec_to_rotmat(vector.float()).double(), expected, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-9, 0.5, np.pi, 5.0])
+def test_gradient_of_rotvec_to_rotmat_matches_differences(length: float) -> None:
+    vector, weight = length * unit_vectors(4), normal(3, 3, 3)
+    free = vector.clone().requires_grad_()
+    (found,) = torch.autograd.grad((weight * rotvec_to_rotmat(free)).sum(), free)
+    step = 1e-5 * torch.eye(3, dtype=torch.float64)
+    ends = [Rotation.from_rotvec((vector + way * step).numpy()).as_matrix() for way in (1, -1)]
+    expected = (weight * torch.from_numpy(ends[0] - ends[1]) / 2e-5).sum((1, 2))
+    assert_close(found, expected, atol=1e-8, rtol=0)
 
 
 @quick

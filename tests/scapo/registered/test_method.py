@@ -223,7 +223,7 @@ def test_rounds_over_the_clouds_that_were_placed():
     config = RegisteredConfig(epochs=3, placed=20)
     made = TemplateRegistration(config, CATEGORIES["drawer"], generator(0))
     stages = [(stage.name, stage.epochs, stage.clouds) for stage in made.stages()]
-    assert stages == [("votes", 3, 20), ("round-2", 3, 20)]
+    assert stages == [("votes", 2, 20), ("round-2", 3, 20)]
     assert made.variant == ""
     assert sum(p.numel() for p in made.parameters()) < 1_500_000
 
