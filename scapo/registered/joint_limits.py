@@ -69,11 +69,8 @@ def units(kinds: tuple[JointKind, ...]) -> list[float]:
 @torch.no_grad()
 def limits_of(state: Float[Tensor, "B J"], kinds: tuple[JointKind, ...]) -> JointLimits:
     """The range of inliers' states, but for single outliers (`SPAN`)."""
-    return JointLimits(
-        low=state.quantile(SPAN[0], 0),
-        high=state.quantile(SPAN[1], 0),
-        unit=state.new_tensor(units(kinds)),
-    )
+    low, high = state.quantile(torch.tensor(SPAN).to(state), 0)
+    return JointLimits(low=low, high=high, unit=state.new_tensor(units(kinds)))
 
 
 @torch.no_grad()

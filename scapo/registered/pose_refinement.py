@@ -76,18 +76,32 @@ def refine(
 
     The loss is over every second point, or all if the steps use them all.
     """
-    placements, losses = [], []
-    chunk = max(1, CHUNK * LIGHT // max(LIGHT, len(template.points)))
-    for index in torch.arange(len(views.points), device=views.points.device).split(chunk):
-        part = take(views, index)
-        placement = refine_gauss_newton(template, part, take(start, index), options)
-        total = part.points.shape[1]
-        every = 1 if options.points >= total else 2
-        some = part.thinned(torch.arange(0, total, every, device=index.device))
-        loss = view_loss(some, template.place(placement), RANKED, BACKWARD)
-        placements.append(placement)
-        losses.append(loss + SCALE_WEIGHT * placement.log_scale.square().sum(-1))
-    return cat(placements), torch.cat(losses)
+    placement = improved(template, views, start, options)
+    total = views.points.shape[1]
+    every = 1 if options.points >= total else 2
+    some = views.thinned(torch.arange(0, total, every, device=views.points.device))
+    losses = [
+        view_loss(take(some, index), template.place(take(placement, index)), RANKED, BACKWARD)
+        for index in _chunks(template, views)
+    ]
+    return placement, torch.cat(losses) + SCALE_WEIGHT * placement.log_scale.square().sum(-1)
+
+
+def improved(
+    template: ArticulatedTemplate, views: PartialViews, start: Placement, options: StepOptions
+) -> Placement:
+    """The same without the losses."""
+    parts = [
+        refine_gauss_newton(template, take(views, index), take(start, index), options)
+        for index in _chunks(template, views)
+    ]
+    return cat(parts)
+
+
+def _chunks(template: ArticulatedTemplate, views: PartialViews) -> tuple[Tensor, ...]:
+    """Views that are looked at together: a matter of memory."""
+    size = max(1, CHUNK * LIGHT // max(LIGHT, len(template.points)))
+    return torch.arange(len(views.points), device=views.points.device).split(size)
 
 
 @torch.no_grad()

@@ -23,7 +23,14 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.joint_limits import JointLimits, limits_of, narrowest_limits
 from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pairwise import distinct, within
-from scapo.registered.pose_refinement import CHUNK, LIGHT, StepOptions, refine, search_states
+from scapo.registered.pose_refinement import (
+    CHUNK,
+    LIGHT,
+    StepOptions,
+    improved,
+    refine,
+    search_states,
+)
 from scapo.registered.synchronisation import densest
 from scapo.registered.template import ArticulatedTemplate, Placement, interleave
 from scapo.registered.upright import LEANING, OVER, Upright
@@ -418,7 +425,7 @@ def successive_halving(
     repeated = take(views, first.repeat_interleave(len(placement.state) // count))
     if effort.again:
         placement = _states_again(sparse, repeated, placement, space.states)
-    placement, _ = refine(sparse, repeated, placement, effort.long)
+    placement = improved(sparse, repeated, placement, effort.long)
     placement, loss = refine(template, repeated, placement, effort.last)
     unlike = space.unlikeness(views, placement.rotation.unflatten(0, (count, -1)))
     return Hypotheses(placement=placement, loss=loss.view(count, -1), unlike=unlike)
@@ -447,7 +454,7 @@ def refine_states(
     for sharpness in STATES:
         some, states = views.thinned(_every(views, STATE_EVERY)), limits.grid(STATE_GRID)
         placement = search_states(sparse, some, placement, states, sharpness)
-        placement, _ = refine(template, views, placement, STATE_STEPS)
+        placement = improved(template, views, placement, STATE_STEPS)
     return placement
 
 
