@@ -160,7 +160,7 @@ def _made_thin(
     for reach in FANNED:
         observed = observe_part_rotations(thin, views, placement, (reach,), poses)
         poses = rotated_poses(thin, placement, observed)
-        rebuild(thin, views, placement, poses=poses, generator=generator)
+        rebuild(thin, views, placement, poses=poses, settled=True, generator=generator)
     return thin, observe_part_rotations(thin, views, placement, REACHES, poses)
 
 
@@ -182,7 +182,7 @@ def _fitted(
     template, views, placement = found.template, found.inliers.views, found.inliers.placement
     for number in range(ROUNDS):
         if number == 1:
-            rebuild(template, views, placement, generator=generator)
+            rebuild(template, views, placement, settled=True, generator=generator)
         placement, _ = bundle_adjust(template, views, placement, options, generator=generator)
         observed = observe_part_rotations(template, views, placement, REACHES)
         keep(template, learn_deviations(observed, placement.state, rests))

@@ -181,7 +181,7 @@ def densified(
     views, placement = candidate.inliers.views, candidate.inliers.placement
     dense = candidate.template.with_points(config.final_points)
     for number in range(rounds):
-        rebuild(dense, views, placement, generator=generator)
+        rebuild(dense, views, placement, settled=True, generator=generator)
         if config.held_frame and not tells_frame(dense):  # it follows the axis, which still moves
             placement = along_main_directions(dense, placement)
         if config.way_out and number == 0:

@@ -28,7 +28,8 @@ from scapo.registered.template import (
 from scapo.registered.view_loss import SEEN_WITHIN, match_weight
 from scapo.registered.views import PartialViews
 
-OBSERVERS = 24  # Views, at most, that are asked about the points of the others
+OBSERVERS, SETTLED_OBSERVERS = 24, 72
+"""Views, at most, that are asked about the points of others, and once placements are settled."""
 PRIOR = 0.3
 """Views added to those that agree and to those that do not: where none tells, support is a half."""
 SAME_PLACE = 400.0
@@ -45,7 +46,8 @@ LEAST_COUNT, ALL_COUNT = 40, 6000
 """Points of a view that the template is built from, at least, and of all views together."""
 BASE_BONUS, LEAST_BONUS, LEAST_PART = 0.3, 0.1, 0.05
 """Log support by which the base wins over a part, so that what nothing tells apart stays with it;
-that where it would leave a part with less than this share of the points."""
+that where it would leave a part with less than this share of the points, and for hinges once
+placements are settled: what lies near a hinge moves little, but turns."""
 SUPPORTED = 0.4  # Share of the views that must agree for a point to enter the template
 SEEN = 0.05  # Share of the observers that must have seen it, or more than one view
 LEAST_GOOD = 50  # Points without which the template stays as it was
@@ -145,6 +147,7 @@ def rebuild(
     placement: Placement,
     *,
     poses: PartPoses | None = None,
+    settled: bool = False,
     generator: torch.Generator,
 ) -> None:
     """Build the template's points and part weights anew from all views at their placements.
@@ -154,35 +157,41 @@ def rebuild(
         views: B views.
         placement: Theirs.
         poses: Of the parts, if they are not as placed.
-        generator: Draws the `OBSERVERS`.
+        settled: Whether placements are near their end: more views are asked, hinged parts have
+            what tells little.
+        generator: Draws the observers.
     """
     count = max(LEAST_COUNT, min(views.points.shape[1], ALL_COUNT // len(views.points)))
     order = torch.randperm(len(views.points), generator=generator, device=generator.device)
+    observers = order[: SETTLED_OBSERVERS if settled else OBSERVERS]
     evidence = gather_evidence(
         views,
         template.part_poses(placement) if poses is None else poses,
         placement.log_scale,
         count=count,
-        observers=order[:OBSERVERS],
+        observers=observers,
     )
     score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
     score = smooth(views, score)
     if not template.alike:
-        score = favouring_base(score)
+        hinged = settled and "prismatic" not in template.kinds  # a wall slides in itself
+        score = favouring_base(score, LEAST_BONUS if hinged else BASE_BONUS)
     part = score.argmax(-1)
     chosen = part[..., None, None].expand(*part.shape, 1, 3)
     points = evidence.points.gather(2, chosen)[:, :, 0].flatten(0, 1)
     normals = evidence.normals.gather(2, chosen)[:, :, 0].flatten(0, 1)
     support = evidence.log_support.gather(2, part[..., None])[..., 0].flatten().exp()
     seen = evidence.seen.gather(2, part[..., None])[..., 0].flatten()
-    good = (support > SUPPORTED) & (seen > max(1.0, SEEN * min(OBSERVERS, len(order))))
+    good = (support > SUPPORTED) & (seen > max(1.0, SEEN * len(observers)))
     _resample(template, points, normals, score.flatten(0, 1), support, good)
 
 
-def favouring_base(score: Float[Tensor, "B K P"]) -> Float[Tensor, "B K P"]:
+def favouring_base(
+    score: Float[Tensor, "B K P"], bonus: float = BASE_BONUS
+) -> Float[Tensor, "B K P"]:
     """Log support with a bonus for the base: less where it would leave a part almost nothing."""
     base = F.one_hot(torch.tensor(0), score.shape[-1]).to(score)
-    favoured = score + BASE_BONUS * base
+    favoured = score + bonus * base
     count = favoured.argmax(-1).flatten().bincount(minlength=score.shape[-1])
     scarce = bool(count.min() < LEAST_PART * count.sum())
     return score + LEAST_BONUS * base if scarce else favoured
