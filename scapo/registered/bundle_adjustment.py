@@ -57,6 +57,7 @@ ROUNDS = 4  # Of rebuilding and adjusting
 FIRST_STEPS, FIRST_SEARCHED, LAST_STEPS = 30, (0, 15), 20
 """Of a first fit: steps of each round, where states are searched in them, steps after the last."""
 LATE_STEPS = 25  # Of each round on inliers
+AXES_SETTLE = 2  # Dense rounds after which parts are told as of settled placements
 BLUNT, SHARP, SHARPEST = (60.0, 200.0), (120.0, 300.0), (150.0, 400.0)
 """Sharpness (of `match_weight`) at the first and last step: of the first round, of the others of a
 first fit, and of those on inliers."""
@@ -181,7 +182,8 @@ def densified(
     views, placement = candidate.inliers.views, candidate.inliers.placement
     dense = candidate.template.with_points(config.final_points)
     for number in range(rounds):
-        rebuild(dense, views, placement, settled=True, generator=generator)
+        settled = number >= AXES_SETTLE
+        rebuild(dense, views, placement, settled=settled, generator=generator)
         if config.held_frame and not tells_frame(dense):  # it follows the axis, which still moves
             placement = along_main_directions(dense, placement)
         if config.way_out and number == 0:
