@@ -67,6 +67,9 @@ class DiscoveryConfig(TemplateConfig):
     """Views held out to judge templates, at most a quarter of all."""
     range_cost: float = RANGE_COST
     """Mean loss that a radian of a joint's range must save; 0: any joint limits."""
+    askew_cost: float = 0.05
+    """Mean loss that two joints of one kind must save whose axes are at right angles: those of made
+    things are mostly parallel; 0: nothing."""
     axis_weight: float = 1.0
     """Pull of the axes to the main directions of the base once a template is chosen (before, wrong
     axes must be free to turn) and where the base has two of them; 0: none."""
@@ -105,7 +108,7 @@ class SearchConfig:
     """Training clouds in which the template is then searched for as `quick` does, 0.08 s each."""
     rounds: int = 2
     """How often that is done, and the network taught: from the second time on its word counts."""
-    epochs: int = 24
+    epochs: int = 32
     """Epochs of the network in the last round, and twice those of a round before, which has to tell
     no more than how clouds are placed anew."""
     lr: float = 2e-3
@@ -177,7 +180,7 @@ class RegisteredConfig(SearchConfig):
 
 
 def cpu_config() -> RegisteredConfig:
-    """Trains one category in some 12 minutes on two cores."""
+    """Trains one category in some 14 minutes on two cores."""
     return RegisteredConfig()
 
 

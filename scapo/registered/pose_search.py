@@ -305,10 +305,21 @@ def search_views(
 def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConfig) -> float:
     """Mean loss of views within their narrowest joint limits, plus what that range costs.
 
-    The range counts because a joint along a wrong axis explains almost as much with more of it.
+    The range counts because a joint along a wrong axis explains almost as much with more of it, and
+    so does, for joints of one kind, how far from parallel they are.
     """
     found, limits = _within_limits(candidate, search_near(candidate, views), config)
-    return float(found.loss.mean()) + config.range_cost * limits.extent()
+    cost = config.range_cost * limits.extent() + config.askew_cost * askew(candidate.template)
+    return float(found.loss.mean()) + cost
+
+
+@torch.no_grad()
+def askew(template: ArticulatedTemplate) -> float:
+    """How far from parallel joints of one kind are: sum of 1 - |cosine| over their pairs."""
+    axes, kinds = template.directions(), template.kinds
+    pairs = product(range(len(kinds)), repeat=2)
+    alike = [(i, j) for i, j in pairs if i < j and kinds[i] == kinds[j]]
+    return sum(1 - abs(float(axes[i] @ axes[j])) for i, j in alike)
 
 
 def _within_limits(

@@ -13,6 +13,7 @@ from scapo.registered.pose_search import (
     THOROUGH,
     SearchResult,
     SearchSpace,
+    askew,
     best_of,
     combinations,
     modes_of,
@@ -20,7 +21,7 @@ from scapo.registered.pose_search import (
     refine_states,
     search,
 )
-from scapo.registered.template import Placement
+from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_bank import ViewBank
 from tests.helpers.sighted import sighted, template
 
@@ -41,6 +42,14 @@ def test_known_placements_are_found():
     assert state.max() < 0.2
     high = JointLimits(low=torch.tensor([3.0]), high=torch.tensor([4.0]), unit=torch.ones(1))
     assert torch.allclose(hypotheses.best(high).loss, found.loss + OUTSIDE_COST)
+
+
+def test_joints_of_one_kind_are_askew_that_are_not_parallel():
+    made = ArticulatedTemplate(("revolute", "prismatic", "revolute", "revolute"), 10)
+    axes = torch.tensor([[2.0, 0, 0], [0, 0, 1], [-1, 0, 0], [0.6, 0.8, 0]])
+    made.axis.data.copy_(axes)  # no length, and no sense, is asked for
+    assert abs(askew(made) - 2 * 0.4) < 1e-6
+    assert askew(ArticulatedTemplate(("revolute",), 10)) == 0
 
 
 def test_a_wrong_state_is_corrected_and_the_rest_kept():
