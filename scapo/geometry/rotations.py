@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rotations by roma, which is imported at the first call: it loads the compiler, over a second.
+"""Rotations, most by roma, imported at the first call: it loads the compiler, over a second.
 
 Vectors are axis times angle in radians; matrices act on columns; quaternions are xyzw.
 """
