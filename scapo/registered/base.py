@@ -306,7 +306,7 @@ class AbstractRegistered(AbstractMethod):
         """The template over its states, and where the network places it."""
         del stage
         seen = self._seen(observation)
-        placement = self._voted(seen)[0]
+        placement = self._voted(seen).placement
         return template_pictures(self.template, self._limits(), seen.views.points, placement)
 
     @torch.no_grad()
@@ -315,13 +315,10 @@ class AbstractRegistered(AbstractMethod):
         if mode == "whole":
             return self._of_surfaces(map_tensors(observation, lambda x: x.to(self.template.points)))
         seen = self._seen(observation)
-        if mode == "fast" and self._has_learned():
-            chosen, weight, confidence = self._voted(seen)
-        else:
-            chosen, confidence = self._searched(seen, mode)
-            weight = seen.part_weights(self.template, chosen)
-        chosen = turn_placement(chosen, seen.frame.mT)
-        return self._answer(chosen, weight, seen.similarity, confidence)
+        alone = mode == "fast" and self._has_learned()
+        said = self._voted(seen) if alone else self._searched(seen, mode)
+        chosen = turn_placement(said.placement, seen.frame.mT)
+        return self._answer(chosen, said.part_weight, seen.similarity, said.sure)
 
     def _of_surfaces(self, observation: Observation) -> Prediction:
         """Of clouds that show all of an object, not the side that a camera sees.
@@ -348,8 +345,8 @@ class AbstractRegistered(AbstractMethod):
     ) -> tuple[Placement, Float[Tensor, " B"], Similarity]:
         """What the network alone says of a view: a placement in normalised clouds, how sure."""
         seen = self._seen(observation)
-        placement, _, sure = self._voted(seen)
-        return turn_placement(placement, seen.frame.mT), sure, seen.similarity
+        said = self._voted(seen)
+        return turn_placement(said.placement, seen.frame.mT), said.sure, seen.similarity
 
     def _has_learned(self) -> bool:
         """Whether the network can be asked; of a method that was never trained there is no more."""
@@ -386,20 +383,20 @@ class AbstractRegistered(AbstractMethod):
             raise ValueError("up: expected a model in the object's frame, whose base comes first")
         return Upright(own=torch.tensor(self.up).to(up), seen=up)
 
-    def _voted(
-        self, seen: SeenClouds
-    ) -> tuple[Placement, Float[Tensor, "B N P"], Float[Tensor, " B"]]:
-        """What the network alone says: placement, part weights, and how sure it is."""
+    def _voted(self, seen: SeenClouds) -> Said:
+        """What the network alone says."""
         if isinstance(self.network, PointVotes):
             kept = seen.views.points
             placement, votes, sure = surest(self.network, kept)
             weight = gather(votes.part.softmax(-1), nearest(seen.points, kept))
+            said = Said(placement=placement, part_weight=weight, sure=sure)
         else:
-            placement, weight, sure = voted(self.network, self.template, seen, self.config.looks)
-        if (upright := self._upright(seen.up)) is not None:
-            sure = sure * (1 - upright.leaning(placement.rotation)).clamp(0, 1)
-            placement = upright.raised(self.template, placement)
-        return placement, weight, sure
+            said = voted(self.network, self.template, seen, self.config.looks)
+        if (upright := self._upright(seen.up)) is None:
+            return said
+        level = (1 - upright.leaning(said.placement.rotation)).clamp(0, 1)
+        raised = upright.raised(self.template, said.placement)
+        return replace(said, placement=raised, sure=said.sure * level)
 
     def _answer(
         self,
@@ -428,7 +425,7 @@ class AbstractRegistered(AbstractMethod):
         away = -similarity.centre if sensor is None else sensor - similarity.centre
         return away * similarity.scale[:, None]
 
-    def _searched(self, seen: SeenClouds, mode: Mode) -> tuple[Placement, Float[Tensor, " B"]]:
+    def _searched(self, seen: SeenClouds, mode: Mode) -> Said:
         """The best hypothesis after a few steps, and its margin."""
         said = self._said(seen)
         left = self._hypotheses(seen, said, mode == "refine")
@@ -440,14 +437,16 @@ class AbstractRegistered(AbstractMethod):
             final, _ = refine_deviations(self.template, seen.views, final)
         if (upright := self._upright(seen.up)) is not None:
             final = upright.raised(self.template, final)
-        return final if said is None else hinged_as(self.template, said[0], final), found.margin
+        if said is not None:
+            final = hinged_as(self.template, said.placement, final)
+        weight = seen.part_weights(self.template, final, said)
+        return Said(placement=final, part_weight=weight, sure=found.margin)
 
     def _said(self, seen: SeenClouds) -> Said | None:
-        """A placement by the network that knows cameras, and how sure it is; None without one."""
+        """What the network that knows cameras says; None without one."""
         if isinstance(self.network, PointVotes) or not self._has_learned():
             return None
-        placement, _, sure = self._voted(seen)
-        return placement, sure
+        return self._voted(seen)
 
     def _hypotheses(self, seen: SeenClouds, said: Said | None, refine: bool) -> Hypotheses:
         """Those that are left in the end."""
@@ -466,7 +465,7 @@ class AbstractRegistered(AbstractMethod):
         """What is left of the network's and `beside` more, charged where it dissents."""
         views, upright = seen.views, self._upright(seen.up)
         space = replace(self._space(), upright=upright)
-        start = self._without_network(views, beside) if said is None else undeviated(said[0])
+        start = self._without_network(views, beside) if said is None else undeviated(said.placement)
         if said is not None and beside:
             start = interleave([start, space.propose(views, beside)], len(views.points))
         if upright is not None:
@@ -474,7 +473,7 @@ class AbstractRegistered(AbstractMethod):
         left = successive_halving(self.template, views, start, space, by)
         if said is None:
             return left
-        charge = dissent(self.template, *said, left.placement, self.config.dissent)
+        charge = dissent(self.template, said, left.placement, self.config.dissent)
         return replace(left, unlike=left.unlike + charge)
 
     def _without_network(self, views: PartialViews, count: int) -> Placement:

@@ -51,10 +51,17 @@ THINNED = 0.2  # Share of a cloud's points that the network may not be shown in 
 OTHER_WAY = 0.4  # Rad: from about there on a part is turned another way than the network says
 UNIT = 127  # Of stored normals
 PRICE = 5.0  # Of a unit of loss by which the search prefers another candidate, in the network's
+WORD, LEAST = 0.35, 0.02  # The network's share in a point's part, beside a search; a floor for both
 
 
-Said = tuple[Placement, Float[Tensor, " B"]]
-"""What a network says: placements, and how sure it is of each."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Said:
+    """What a network or a search says of clouds."""
+
+    placement: Placement
+    part_weight: Float[Tensor, "B N P"]
+    sure: Float[Tensor, " B"]
+    """Of the network 1 where its votes agree, to 0; of a search the margin of the best."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,13 +82,20 @@ class SeenClouds:
     """Against gravity, where that is known."""
 
     def part_weights(
-        self, template: ArticulatedTemplate, placement: Placement
+        self, template: ArticulatedTemplate, placement: Placement, said: Said | None = None
     ) -> Float[Tensor, "B N P"]:
-        """Of all points, by a placement of the template."""
+        """Of all points, by a placement of the template and by what the network says, if it does.
+
+        A logarithmic pool (Genest and Zidek, 1986): a part that the template is sure of stays.
+        """
         normals = self.normals
         if not bool(self.inlier.all()):  # outliers have normals of their own
             normals = surface_normals(self.points, self.points, self.views.camera)
-        return nearest_weights(template, self.points, normals, placement)
+        weight = nearest_weights(template, self.points, normals, placement)
+        if said is None:
+            return weight
+        word = (said.part_weight + LEAST).log()
+        return ((weight + LEAST).log() + WORD * word).softmax(-1)
 
 
 def learned_row(step: Step, count: int) -> Int[Tensor, " B"]:
@@ -239,8 +253,8 @@ def taught_in_principal_frames(
 @torch.no_grad()
 def voted(
     network: ViewNetwork, template: ArticulatedTemplate, seen: SeenClouds, looks: int = 1
-) -> tuple[Placement, Float[Tensor, "B N P"], Float[Tensor, " B"]]:
-    """What the network says: placement in the clouds' frames, part weights, how sure it is.
+) -> Said:
+    """What the network says, placements in the clouds' frames.
 
     It sees each cloud in as many rolls about the camera's ray as it has looks. What it says in them
     is averaged, where the base lies as in the look in which the votes agree best.
@@ -265,7 +279,7 @@ def voted(
     placement, sure = placed_by_votes(votes, seen.clean, template)
     if bool(network.hinged):
         placement = replace(placement, pivot=votes.pivot(template))
-    return placement, votes.part.softmax(-1), sure
+    return Said(placement=placement, part_weight=votes.part.softmax(-1), sure=sure)
 
 
 def undeviated(placement: Placement) -> Placement:
@@ -290,8 +304,7 @@ def hinged_as(template: ArticulatedTemplate, said: Placement, found: Placement) 
 
 def dissent(
     template: ArticulatedTemplate,
-    said: Placement,
-    sure: Float[Tensor, " B"],
+    said: Said,
     hypotheses: Placement,
     price: float,
 ) -> Float[Tensor, "B F"]:
@@ -299,12 +312,11 @@ def dissent(
 
     Args:
         template: Whose parts they are.
-        said: The network's placement of B views.
-        sure: 1 where its votes agree, to 0.
+        said: The network's of B views.
         hypotheses: F of each, those of a view in a row.
         price: Loss that a part costs which is turned another way.
     """
-    own = template.part_poses(said).rotation[:, None]  # (B, 1, P, 3, 3)
-    other = template.part_poses(hypotheses).rotation.unflatten(0, (len(sure), -1))
+    own = template.part_poses(said.placement).rotation[:, None]  # (B, 1, P, 3, 3)
+    other = template.part_poses(hypotheses).rotation.unflatten(0, (len(own), -1))
     apart = rotation_angle(other, own.expand_as(other))
-    return price * sure[:, None] * (1 - torch.exp(-(apart / OTHER_WAY).square())).sum(-1)
+    return price * said.sure[:, None] * (1 - torch.exp(-(apart / OTHER_WAY).square())).sum(-1)

@@ -47,7 +47,7 @@ def main(run: Path, data: Path, category: str, count: int) -> None:
     template, placed, scales = method.template, [], []
     for row in torch.arange(len(labels.instance)).split(AT_A_TIME):
         seen = method._seen(take(observation, row))
-        placed.append(turn_placement(method._searched(seen, "quick")[0], seen.frame.mT))
+        placed.append(turn_placement(method._searched(seen, "quick").placement, seen.frame.mT))
         scales.append(seen.similarity)
     placement, similarity = cat(placed), cat(scales)
     base = similarity.inverse(placement.translation[:, None])

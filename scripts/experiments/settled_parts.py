@@ -42,7 +42,7 @@ def main(run: Path, data: str, category: str, out: Path, settled: bool) -> None:
     cloud = torch.stack([torch.as_tensor(one["points"]) for one in some]).float()
     with torch.no_grad():
         seen = method._seen(Observation(points=cloud))
-        placement, agreed = method._searched(seen, "quick")[0], method._voted(seen)[2]
+        placement, agreed = method._searched(seen, "quick").placement, method._voted(seen).sure
     rows = agreed.argsort(descending=True)[:SURE][evenly(SURE, FITTED)]
     views, placement = take(seen.views, rows), replace(take(placement, rows), pivot=None)
     template, config = method.template, method.config.discovery

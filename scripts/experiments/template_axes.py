@@ -60,8 +60,9 @@ def main(run: Path, data: str, category: str, clouds: int, rounds: int, seed: in
     axes = torch.stack([torch.as_tensor(one["joint_axis"]) for one in some]).float()
     with torch.no_grad():
         seen = method._seen(Observation(points=cloud))
-        placement, confidence = method._searched(seen, "refine")
-    views, axes = seen.views, axes @ seen.frame.mT  # in the clouds' own frames
+        said = method._searched(seen, "refine")
+    views, placement, confidence = seen.views, said.placement, said.sure
+    axes = axes @ seen.frame.mT  # in the clouds' own frames
     template, config = method.template, method.config.discovery
     tell("as trained", template, placement, axes)
     sure = (confidence > confidence.quantile(SURE)).nonzero()[:, 0]

@@ -12,7 +12,7 @@ from torch.testing import assert_close
 from scapo.geometry.rigid import rotation_angle
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
-from scapo.registered.learning import UNIT, dissent, taught, undeviated, voted
+from scapo.registered.learning import UNIT, Said, dissent, taught, undeviated, voted
 from scapo.registered.view_network import ViewNetwork
 from scapo.types import Observation
 from tests.helpers.sighted import sighted, template
@@ -71,11 +71,31 @@ def test_parts_that_lie_another_way_than_the_network_says_cost() -> None:
             )
         ]
     )
-    cost = dissent(shape, truth, torch.tensor([1.0, 0.5]), hypotheses, 0.3)
+    sure, weight = torch.tensor([1.0, 0.5]), torch.zeros(2, 1, 2)
+    said = Said(placement=truth, part_weight=weight, sure=sure)
+    cost = dissent(shape, said, hypotheses, 0.3)
     assert_close(cost[:, 0], torch.zeros(2), atol=1e-5, rtol=0)
     assert bool((cost[:, 1] < 0.03).all())
     assert_close(cost[:, 2], 0.3 * torch.tensor([1.0, 0.5]), atol=1e-4, rtol=0)
     assert_close(cost[:, 3], 0.6 * torch.tensor([1.0, 0.5]), atol=1e-4, rtol=0)
+
+
+def test_points_that_the_template_leaves_unsureare_of_the_part_that_the_network_says() -> None:
+    """Against the powers of both, point by point; where the template is sure it stays."""
+    method, observation = trained(0)
+    seen = method._seen(observation)
+    placement = method._searched(seen, "quick").placement
+    plain = seen.part_weights(method.template, placement)
+    other = torch.eye(2)[1 - plain.argmax(-1)]  # Of each point the part that it is not of
+    said = Said(placement=placement, part_weight=other, sure=torch.ones(len(plain)))
+    found = seen.part_weights(method.template, placement, said)
+    product = (plain + 0.02) * (other + 0.02) ** 0.35
+    assert_close(found, product / product.sum(-1, keepdim=True))
+    flipped = found.argmax(-1) != plain.argmax(-1)
+    assert not bool(flipped[plain.amax(-1) > 0.9].any())
+    unsure = plain.amax(-1) < 0.7
+    assert bool(unsure.any())
+    assert bool(flipped[unsure].all())
 
 
 def test_a_search_begins_about_the_axes_of_the_category() -> None:
@@ -104,7 +124,9 @@ def test_a_view_is_answered_alike_in_every_quarter_roll() -> None:
     quarter = rotvec_to_rotmat(torch.tensor([0, 0, torch.pi / 2]))
     rolled = replace(seen, views=replace(seen.views, look=quarter @ seen.views.look))
     for looks, alike in ((4, True), (1, False)):
-        found = [voted(method.network, method.template, one, looks)[0] for one in (seen, rolled)]
+        found = [
+            voted(method.network, method.template, one, looks).placement for one in (seen, rolled)
+        ]
         apart = rotation_angle(found[0].rotation, found[1].rotation).max()
         assert (float(apart) < 1e-3) == alike
 
@@ -127,7 +149,8 @@ def test_a_look_that_means_another_frame_does_not_count(monkeypatch: pytest.Monk
     monkeypatch.setattr(
         ViewNetwork, "forward", lambda *_: replace(said, points=said.points + noise)
     )
-    found, part, _ = voted(network, shape, seen, 3)
+    answer = voted(network, shape, seen, 3)
+    found = answer.placement
     assert rotation_angle(found.rotation, truth.rotation).max() < 1e-3
     assert_close(found.log_scale, truth.log_scale)
-    assert_close(part, said.part[:3].softmax(-1))
+    assert_close(answer.part_weight, said.part[:3].softmax(-1))
