@@ -15,8 +15,11 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -24,7 +27,7 @@ from torch import Tensor
 from bench.requests import EvaluateRequest, Mode, PredictRequest
 from bench.runs import predict as asking
 from bench.scoring.evaluate import evaluate
-from scapo.registered import base, pose_refinement, view_loss
+from scapo.registered import base, learning, pose_refinement, view_loss
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.pose_search import SearchSpace, light, modes_of
 from scapo.registered.view_bank import ViewBank
@@ -53,11 +56,11 @@ def configured(**options: object) -> Change:
 def in_space(change: Callable[[TemplateRegistration, SearchSpace], SearchSpace]) -> Change:
     """The method with another search space."""
 
-    def patch(method: TemplateRegistration) -> None:
+    def change_space(method: TemplateRegistration) -> None:
         usual = method._space
         method._space = lambda: change(method, usual())
 
-    return patch
+    return change_space
 
 
 def cameras_anywhere(method: TemplateRegistration, space: SearchSpace) -> SearchSpace:
@@ -102,9 +105,17 @@ CHANGES: dict[str, Change | None] = {
     "parts as their states say": as_states_say,
     "banks better by any loss": None,
     "banks never better": None,
+    "points' parts by the template alone": None,
 }
-MARGINS = {"banks better by any loss": 0.0, "banks never better": 100.0}
-"""Loss by which `refine` wants another hypothesis to be better than the network's."""
+PATCHES: dict[str, list[tuple[ModuleType, str, object]]] = {
+    "no free space, nothing unseen": [
+        (module, "should_be_seen", nothing_seen) for module in (pose_refinement, view_loss)
+    ],
+    "banks better by any loss": [(base, "BETTER", 0.0)],
+    "banks never better": [(base, "BETTER", 100.0)],
+    "points' parts by the template alone": [(learning, "WORD", 0.0)],
+}
+"""What stands in a module in place of what it has."""
 
 
 def scores(run: Path, data: Path, count: int, mode: Mode, name: str) -> list[float]:
@@ -120,26 +131,21 @@ def scores(run: Path, data: Path, count: int, mode: Mode, name: str) -> list[flo
             change(method)
         return method, header
 
-    seen = pose_refinement.should_be_seen
-    if name.startswith("no free space"):
-        pose_refinement.should_be_seen = view_loss.should_be_seen = nothing_seen
-    usually, base.BETTER = base.BETTER, MARGINS.get(name, base.BETTER)
-    asking.load = load
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "p.safetensors"
-            asked = PredictRequest(checkpoint=run, data=data, out=out, split="val", mode=mode,
-                                   limit=count, up=name == "known up")  # fmt: skip
-            asking.predict(asked)
-            found = evaluate(
-                EvaluateRequest(
-                    predictions=out, data=data, split="val", out=Path(folder) / "s.csv.gz",
-                    companions=False,
-                )
-            )  # fmt: skip
-    finally:
-        asking.load, base.BETTER = usual, usually
-        pose_refinement.should_be_seen = view_loss.should_be_seen = seen
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        for module, attribute, value in [(asking, "load", load), *PATCHES.get(name, [])]:
+            stack.enter_context(patch.object(module, attribute, value))
+        asked = PredictRequest(
+            checkpoint=run, data=data, out=folder / "p.safetensors", split="val", mode=mode,
+            limit=count, up=name == "known up",
+        )  # fmt: skip
+        asking.predict(asked)
+        found = evaluate(
+            EvaluateRequest(
+                predictions=asked.out, data=data, split="val", out=folder / "s.csv.gz",
+                companions=False,
+            )
+        )  # fmt: skip
     return [factor * found["summary"][key]["mean"] for key, factor in COLUMNS.items()]
 
 
