@@ -75,8 +75,10 @@ def plan_of(
     plan["judging templates"] = judged * left * (left > 1)
     rounds = numbered("round", len(config.trusted))
     if config.mirror and rounds:
-        plan |= {f"{rounds[0]}, {one}": half for one in numbered("mirror image", 4)}
-        plan["judging mirror images"] = 4 * (DENSE + judged)
+        images = 4 + are_alike(kinds)
+        plan |= {"judging pairs of parts": 6 * judged} if are_alike(kinds) else {}
+        plan |= {f"{rounds[0]}, {one}": half for one in numbered("mirror image", images)}
+        plan["judging mirror images"] = images * (DENSE + judged)
         rounds = rounds[1:]
     one_round = VIEW * min(config.searched, views) + FIT
     plan |= dict.fromkeys(rounds, one_round)
@@ -93,6 +95,11 @@ def plan_of(
         plan["how objects stand"] = OBJECT_VIEW * AGREEING * shown
     plan["search of all views"] = VIEW * views
     return plan
+
+
+def are_alike(kinds: tuple[JointKind, ...]) -> bool:
+    """Whether joints are two of one kind, whose parts may be each other's mirror images."""
+    return len(kinds) == 2 and kinds[0] == kinds[1]
 
 
 def numbered(what: str, count: int) -> list[str]:

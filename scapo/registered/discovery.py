@@ -10,7 +10,9 @@ one goes on to the end, and whether it goes on with a mirror image of its base.
 The views that agree first may all show the same side. Views of the other side then find nothing
 that explains it, are turned until they look like the first ones, and so never build it. Bodies of
 made things are mostly symmetric: the base together with its mirror image is a candidate to be
-judged against the one without, after both went through a round.
+judged against the one without, after both went through a round. So are the two moving parts of
+many: where joints are two of one kind, one part with its mirror image in place of the other is
+another candidate.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from scapo.categories import JointKind
 from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
@@ -28,7 +32,7 @@ from scapo.records import take
 from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.course import JUDGES, Course, numbered, plan_of
+from scapo.registered.course import JUDGES, Course, are_alike, numbered, plan_of
 from scapo.registered.halves import are_halves, in_halves, may_have_halves
 from scapo.registered.initialisation import common_frame, fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
@@ -302,16 +306,20 @@ def completed(
     rebuilt from views, which leaves out what no view saw, and all with dense templates: of two
     sparse ones that with more surface is the coarser, which costs more than a side that is missing.
     Views of such a side were turned until they looked like others: for their round cameras are
-    sought anywhere.
+    sought anywhere. Of mirror images of a part that goes on which explains the views best at once.
     """
     wholes = [replace(candidate, template=mirrored(candidate.template, axis)) for axis in range(3)]
-    first = numbered("round", len(config.trusted))[0]
-    names = [f"{first}, {one}" for one in numbered("mirror image", len(wholes) + 1)]
+    first, several = numbered("round", len(config.trusted))[0], [candidate, *wholes]
+    if are_alike(candidate.template.kinds):
+        pairs = [paired(candidate, joint, axis) for joint in range(2) for axis in range(3)]
+        judging = partial(ranked, pairs, judges, config, course.journal)
+        several.append(pairs[course.step("judging pairs of parts", judging)[0]])
+    names = [f"{first}, {one}" for one in numbered("mirror image", len(several))]
     own, jobs = own_generators(course.generator, len(names)), dict[str, Callable[[], Candidate]]()
-    for name, one, generator in zip(names, [candidate, *wholes], own, strict=True):
+    for name, one, generator in zip(names, several, own, strict=True):
         jobs[name] = partial(
             advance, one, searched, config.trusted[0], config, generator,
-            anywhere=one is not candidate,
+            anywhere=any(one is whole for whole in wholes),
         )  # fmt: skip
     tried = course.steps(jobs)
     judging = partial(_dense_losses, tried, judges, config, course)
@@ -378,15 +386,66 @@ def mirrored(template: ArticulatedTemplate, axis: int) -> ArticulatedTemplate:
         axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
     """
     base = template.logit.argmax(-1) == 0
-    points, normals = template.points[base].clone(), template.normals[base].clone()
-    if len(points):
-        ends = torch.tensor(SPAN).to(points)
-        points[:, axis] = points[:, axis].quantile(ends).sum() - points[:, axis]
-        normals[:, axis] = -normals[:, axis]
-    points = torch.cat([template.points, points])
-    normals = torch.cat([template.normals, normals])
-    logit = torch.cat([template.logit, template.logit[base]])
+    image = _reflected(template, template.points[base], axis)
+    return _with_surface(
+        template,
+        torch.cat([template.points, image]),
+        torch.cat([template.normals, template.normals[base] * _across(template, axis)]),
+        torch.cat([template.logit, template.logit[base]]),
+    )
+
+
+@torch.no_grad()
+def paired(candidate: Candidate, joint: int, axis: int) -> Candidate:
+    """The candidate with the mirror image of one part, and of its joint, in place of the other.
+
+    Args:
+        candidate: Of two joints of one kind.
+        joint: Whose part is mirrored.
+        axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
+    """
+    template, other = candidate.template, 1 - joint
+    part, swapped = template.logit.argmax(-1), [0, 2, 1]
+    own, kept, across = part == joint + 1, part != other + 1, _across(template, axis)
+    made = _with_surface(
+        template,
+        torch.cat([template.points[kept], _reflected(template, template.points[own], axis)]),
+        torch.cat([template.normals[kept], template.normals[own] * across]),
+        torch.cat([template.logit[kept], template.logit[own][:, swapped]]),
+    )
+    made.pivot[other] = _reflected(template, template.pivot[joint, None], axis)[0]
+    made.axis[other] = -template.axis[joint] * across  # turns are mirrored the other way round
+    placement = candidate.inliers.placement
+    state, shift = placement.state.clone(), placement.shift.clone()
+    state[:, other] = state[:, joint].roll(1)  # states that occur, of other views
+    shift[:, other] = 0
+    inliers = replace(candidate.inliers, placement=replace(placement, state=state, shift=shift))
+    return replace(candidate, template=made, inliers=inliers)
+
+
+def _with_surface(
+    template: ArticulatedTemplate,
+    points: Float[Tensor, "M 3"],
+    normals: Float[Tensor, "M 3"],
+    logit: Float[Tensor, "M P"],
+) -> ArticulatedTemplate:
+    """Another template of these points, as many as it has, spread out."""
     index = spread_out(surface_features(points, normals, logit.softmax(-1)), len(template.points))
     made = template.with_points(len(index))
     made.assign(points[index], normals[index], logit[index])
     return made
+
+
+def _across(template: ArticulatedTemplate, axis: int) -> Float[Tensor, " 3"]:
+    return 1 - 2 * torch.eye(3).to(template.points)[axis]
+
+
+def _reflected(
+    template: ArticulatedTemplate, points: Float[Tensor, "K 3"], axis: int
+) -> Float[Tensor, "K 3"]:
+    """Mirror images through the middle of the base."""
+    base = template.points[template.logit.argmax(-1) == 0]
+    if not len(base):
+        return points
+    ends = base[:, axis].quantile(torch.tensor(SPAN).to(base)).sum()
+    return points * _across(template, axis) + ends * torch.eye(3).to(base)[axis]

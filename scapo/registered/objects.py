@@ -32,7 +32,7 @@ from scapo.registered.orientation import quarter_turns
 from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
-from scapo.registered.view_states import Motion, motion_of
+from scapo.registered.view_states import Motion, apart, motion_of
 from scapo.registered.views import TINY, PartialViews
 
 LEAST_OBJECTS = 4  # That a first template is made of
@@ -314,11 +314,13 @@ def _in_common(
     """
     posed = one.posed
     points, normals = posed.world(one.moved[0].shape[1])
+    motions = [
+        one.motions[k] if own is one.proposals[k][0] else motion_of(posed, one.moved[k], own, kind)
+        for k, own, kind in zip(reading.order, reading.joints, kinds, strict=True)
+    ]
+    motions = apart(posed, reading.joints, motions, kinds)
     moved, states = list[Bool[Tensor, "B K"]](), list[Tensor]()
-    for k, own, joint, kind in zip(reading.order, reading.joints, joints, kinds, strict=True):
-        motion = one.motions[k]
-        if own is not one.proposals[k][0]:
-            motion = motion_of(posed, one.moved[k], own, kind)
+    for motion, own, joint, kind in zip(motions, reading.joints, joints, kinds, strict=True):
         rows = motion.moved[..., None]
         back, facing = motion.back(posed, own, kind)
         points, normals = torch.where(rows, back, points), torch.where(rows, facing, normals)

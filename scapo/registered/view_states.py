@@ -10,7 +10,8 @@ the pairs are asked again with those points alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -79,16 +80,46 @@ def motion_of(
     for _ in range(ROUNDS):
         table = _pair_scores(posed, moved, joint, kind)
         state, score = synchronised_states(table, AMOUNT[kind][1] / STEPS)
-        poses = _part_poses(posed, joint, state, kind)
-        own = torch.arange(len(state))
-        none = torch.zeros_like(posed.translation)
-        evidence = gather_evidence(posed.views, poses, none, count=count, observers=own)
-        log_support = evidence.log_support
-        support = smooth(posed.views, log_support)
-        moved = favouring_base(support - support.mean(-1, keepdim=True)).argmax(-1) == 1
+        part, log_support = _parts_of(posed, [joint], [state], [kind], count)
+        moved = part == 1
     middle = state.quantile(torch.tensor(ENDS)).mean()
     mean = float(log_support.amax(-1).mean())
     return Motion(state=state - middle, moved=moved, score=score, support=mean)
+
+
+@torch.no_grad()
+def apart(
+    posed: PosedViews,
+    joints: Sequence[JointProposal],
+    motions: Sequence[Motion],
+    kinds: Sequence[JointKind],
+) -> tuple[Motion, ...]:
+    """The motions of all joints of one object, every point of one part.
+
+    Each joint by itself takes what another has moved for its own as readily as for the body's.
+    """
+    if len(motions) == 1:
+        return tuple(motions)
+    states, count = [motion.state for motion in motions], motions[0].moved.shape[1]
+    part, _ = _parts_of(posed, joints, states, kinds, count)
+    return tuple(replace(one, moved=part == j + 1) for j, one in enumerate(motions))
+
+
+def _parts_of(
+    posed: PosedViews,
+    joints: Sequence[JointProposal],
+    states: Sequence[Float[Tensor, " B"]],
+    kinds: Sequence[JointKind],
+    count: int,
+) -> tuple[Int[Tensor, "B {count}"], Float[Tensor, "B {count} P"]]:
+    """Of which part the first points of each view are, and the log support of each part."""
+    poses = _part_poses(posed, joints, states, kinds)
+    own = torch.arange(len(posed.translation))
+    none = torch.zeros_like(posed.translation)
+    evidence = gather_evidence(posed.views, poses, none, count=count, observers=own)
+    support = smooth(posed.views, evidence.log_support)
+    part = favouring_base(support - support.mean(-1, keepdim=True)).argmax(-1)
+    return part, evidence.log_support
 
 
 def _pair_scores(
@@ -158,16 +189,18 @@ def _agreement(
 
 
 def _part_poses(
-    posed: PosedViews, joint: JointProposal, state: Float[Tensor, " B"], kind: JointKind
+    posed: PosedViews,
+    joints: Sequence[JointProposal],
+    states: Sequence[Float[Tensor, " B"]],
+    kinds: Sequence[JointKind],
 ) -> PartPoses:
-    """view_T_body and view_T_part at the states."""
-    turn, move = _motion(joint, state, kind)
-    rotation, translation = posed.rotation, posed.translation
-    moved = (rotation @ move[..., None])[..., 0]
-    return PartPoses(
-        rotation=torch.stack([rotation, rotation @ turn], 1),
-        translation=torch.stack([translation, translation + moved], 1),
-    )
+    """view_T_body, and view_T_part of each joint's part, at the states."""
+    rotations, translations = [posed.rotation], [posed.translation]
+    for joint, state, kind in zip(joints, states, kinds, strict=True):
+        turn, move = _motion(joint, state, kind)
+        rotations.append(posed.rotation @ turn)
+        translations.append(posed.translation + (posed.rotation @ move[..., None])[..., 0])
+    return PartPoses(rotation=torch.stack(rotations, 1), translation=torch.stack(translations, 1))
 
 
 def _motion(

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from scapo.registered.joint_proposals import JointProposal, PosedViews
-from scapo.registered.view_states import motion_of, synchronised_states
+from scapo.registered.view_states import apart, motion_of, synchronised_states
 from tests.helpers.sighted import AXIS, PIVOT, sighted
 from tests.helpers.strategies import generator
 
@@ -60,3 +62,21 @@ def test_the_flap_and_its_states_are_found_where_its_hinge_is_known() -> None:
     assert float(torch.linalg.svdvals(flap)[-1] / len(flap) ** 0.5) < 0.03  # flat, as it is
     moving = points[found.moved & ~inside] - PIVOT
     assert float(torch.linalg.svdvals(moving)[-1] / len(moving) ** 0.5) > 0.05
+
+
+def test_every_point_is_of_one_part_where_several_joints_moved() -> None:
+    """Of two joints at the truth's states, the second far from everything, the first has all."""
+    views, truth = sighted(12, seed=7)
+    scene = PosedViews(views=views, rotation=truth.rotation, translation=truth.translation)
+    points, _ = scene.world(128)
+    inside = ((points - torch.tensor([0.0, 0, 0])).abs() < torch.tensor([0.21, 0.29, 0.17])).all(-1)
+    own = motion_of(scene, ~inside, JOINT, "revolute")
+    both = replace(own, moved=~inside)  # As if another joint had taken the flap for its own too
+    beside = replace(JOINT, pivot=PIVOT + torch.tensor([0.0, 0.0, 0.6]))
+    first, second = apart(scene, (JOINT, beside), (own, both), ("revolute", "revolute"))
+    assert not bool((first.moved & second.moved).any())
+    assert torch.equal(first.state, own.state)
+    flap = ~inside
+    assert float((first.moved & flap).sum() / flap.sum()) > 0.6
+    assert float((second.moved & flap).sum() / flap.sum()) < 0.1
+    assert apart(scene, (JOINT,), (both,), ("revolute",)) == (both,)
