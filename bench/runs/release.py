@@ -101,6 +101,9 @@ METRICS = (
 def release(request: ReleaseRequest) -> list[Path]:
     """Write checkpoint, card and answers; returns their paths.
 
+    A released checkpoint that is released to where it is stays to the byte, and so do calibrations
+    of it: its card and answers are made anew, for a program that answers otherwise.
+
     Raises:
         StoreError: No finished run there, no such data, or a model that does not fit.
     """
@@ -109,10 +112,11 @@ def release(request: ReleaseRequest) -> list[Path]:
     require_fields(header, RUN_FIELDS, request.checkpoint)
     if not header["finished"]:
         raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
-    header = {**header, **frame_of_before(method, header, request),
-              "config": without_folders(header["config"])}  # fmt: skip
     source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
-    slim(method, request.out, {**header, "source": sha256_file(source)})
+    if source.resolve() != request.out.resolve():
+        header = {**header, **frame_of_before(method, header, request),
+                  "config": without_folders(header["config"])}  # fmt: skip
+        slim(method, request.out, {**header, "source": sha256_file(source)})
     card = request.out.with_suffix(".md")
     write_bytes(card, card_of(header, request).encode())
     answers = answers_file(request.out)

@@ -78,7 +78,8 @@ class DiscoveryConfig(TemplateConfig):
     way_out: bool = True
     """Take the way out of the body for a sliding joint's axis."""
     mirror: bool = True
-    """Try whether the base lacks a side that is the mirror image of another."""
+    """Try whether the base lacks a side that is the mirror image of another, and whether one of two
+    parts is the other's."""
     halves: bool = True
     """Try whether the two parts of a hinge are halves that are alike."""
     leans: bool = True

@@ -74,6 +74,15 @@ def test_a_release_is_half_as_large_and_answers_alike(folder: Path, monkeypatch)
     assert answers.parent == folder / "results" / "checks"
 
 
+def test_what_lies_there_already_stays_and_its_answers_are_made_anew(folder: Path):
+    weights, card, answers = release(request(folder))
+    before = weights.read_bytes(), card.read_bytes(), answers.read_bytes()
+    card.unlink()
+    answers.unlink()
+    assert release(request(folder, checkpoint=weights)) == [weights, card, answers]
+    assert (weights.read_bytes(), card.read_bytes(), answers.read_bytes()) == before
+
+
 def test_a_run_of_before_gets_its_frame_from_its_own_training_data(folder: Path, monkeypatch):
     split = write_split(folder / "data", "laptop", "train", sample_arrays("laptop", 24, 96))
     made = Alignment.of_order((1, 0), CLOUDS)
