@@ -161,7 +161,8 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
         if not self.size:
             yield from (_do_here(function, job, on_report) for job in jobs)
             return
-        waiting, again = deque(_Attempt(job=job) for job in jobs), deque[_Attempt]()
+        own = [_Attempt(job=job) for job in jobs]
+        waiting, again = deque(own), deque[_Attempt]()
         try:
             while waiting or again or self._busy():
                 self._hand_out(function, waiting, again)
@@ -180,7 +181,8 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
                     again.append(attempt)
         finally:  # left before the end: the next run would take their outcomes for its own
             for worker in self._busy():
-                self._drop(worker)
+                if worker.attempt in own:  # not those of a run that began before this one was freed
+                    self._drop(worker)
 
     def _busy(self) -> list[_Worker]:
         return [worker for worker in self._workers if worker.attempt is not None]

@@ -124,6 +124,17 @@ def test_a_run_that_is_left_before_its_end_leaves_nothing_to_the_next():
         assert [outcome.result for outcome in pool.run(act, [("square", 5)])] == [25]
 
 
+def test_a_run_that_is_freed_late_takes_no_job_from_the_next():
+    """As where an error's traceback holds the first one, which has given all its outcomes."""
+    with Pool(2) as pool:
+        first = pool.run(act, [("square", 5)])
+        assert next(first).result == 25
+        second = pool.run(act, [("square", 2), ("tick", 3)])
+        assert next(second).result == 4
+        first.close()  # while the other job of the second is done
+        assert [outcome.result for outcome in second] == [9]
+
+
 def test_no_jobs_start_no_process():
     with Pool(2) as pool:
         assert list(pool.run(act, [])) == []
