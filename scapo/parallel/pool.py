@@ -180,9 +180,13 @@ class Pool(AbstractPool[Job, Result], Generic[Job, Result]):
                     attempt.label, attempt.amount = "", 0
                     again.append(attempt)
         finally:  # left before the end: the next run would take their outcomes for its own
-            for worker in self._busy():
-                if worker.attempt in own:  # not those of a run that began before this one was freed
-                    self._drop(worker)
+            self._leave(own)
+
+    def _leave(self, own: list[_Attempt]) -> None:
+        """End the workers of a run, not those of one that began before it was freed."""
+        for worker in self._busy():
+            if worker.attempt in own:
+                self._drop(worker)
 
     def _busy(self) -> list[_Worker]:
         return [worker for worker in self._workers if worker.attempt is not None]

@@ -131,7 +131,7 @@ def test_a_run_that_is_freed_late_takes_no_job_from_the_next():
         assert next(first).result == 25
         second = pool.run(act, [("square", 2), ("tick", 3)])
         assert next(second).result == 4
-        first.close()  # while the other job of the second is done
+        del first  # which ends it, while the other job of the second is done
         assert [outcome.result for outcome in second] == [9]
 
 
