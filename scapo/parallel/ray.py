@@ -126,7 +126,7 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._cancel()
+        self._cancel(self._running)
         if self._ours:
             self._ray.shutdown()
 
@@ -139,7 +139,8 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
         within: float = math.inf,
     ) -> Iterator[Outcome[Job, Result]]:
         """See `AbstractPool.run`; the amounts of a lost attempt are reported back as negative."""
-        waiting = deque(_Attempt(job=job) for job in jobs)
+        own = [_Attempt(job=job) for job in jobs]
+        waiting = deque(own)
         task = _task(self._ray, self.gpus)
         try:
             while waiting or self._running:
@@ -160,12 +161,13 @@ class RayPool(AbstractPool[Job, Result], Generic[Job, Result]):
                         self._running.remove(attempt)
                         waiting.appendleft(attempt)
         finally:  # left before the end
-            self._cancel()
+            self._cancel(own)
 
-    def _cancel(self) -> None:
-        for attempt in self._running:
+    def _cancel(self, own: list[_Attempt]) -> None:
+        """End those of a run, not of one that began before it was freed."""
+        for attempt in [running for running in self._running if running in own]:
             self._ray.cancel(attempt.stream, force=True)
-        self._running = []
+            self._running.remove(attempt)
 
     def _slots(self) -> int:
         if self.workers is not None:

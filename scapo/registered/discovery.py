@@ -414,7 +414,8 @@ def paired(candidate: Candidate, joint: int, axis: int) -> Candidate:
         torch.cat([template.logit[kept], template.logit[own][:, swapped]]),
     )
     made.pivot[other] = _reflected(template, template.pivot[joint, None], axis)[0]
-    made.axis[other] = -template.axis[joint] * across  # turns are mirrored the other way round
+    way = -1.0 if template.kinds[joint] == "revolute" else 1.0  # turns are mirrored the other way
+    made.axis[other] = way * template.axis[joint] * across
     placement = candidate.inliers.placement
     state, shift = placement.state.clone(), placement.shift.clone()
     state[:, other] = state[:, joint].roll(1)  # states that occur, of other views

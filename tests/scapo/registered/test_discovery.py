@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from scapo.categories import JointKind
 from scapo.geometry.rigid import axis_angle
 from scapo.method import Journal
 from scapo.records import take
@@ -154,14 +155,15 @@ def test_the_base_is_mirrored_and_the_part_is_not() -> None:
     assert torch.equal(whole.pivot, cut.pivot)
 
 
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
 @pytest.mark.parametrize("joint", [0, 1])
-def test_one_part_is_mirrored_in_place_of_the_other(joint: int) -> None:
+def test_one_part_is_mirrored_in_place_of_the_other(joint: int, kind: JointKind) -> None:
     """Opened as far, the two lie as each other's mirror images; the other itself is gone."""
     g, other = generator(3), 1 - joint
     base = torch.rand(80, 3, generator=g) * torch.tensor([0.4, 0.6, 0.3])
     lid = torch.rand(40, 3, generator=g) * torch.tensor([0.4, 0.1, 0.02]) + 0.3
     rest = torch.rand(60, 3, generator=g)
-    shape = ArticulatedTemplate(("revolute", "revolute"), 180)
+    shape = ArticulatedTemplate((kind, kind), 180)
     part = torch.tensor([0, joint + 1, other + 1]).repeat_interleave(torch.tensor([80, 40, 60]))
     normals = torch.nn.functional.normalize(torch.randn(180, 3, generator=g), dim=-1)
     shape.assign(torch.cat([base, lid, rest]), normals, 9.0 * torch.eye(3)[part])
