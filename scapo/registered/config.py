@@ -54,7 +54,7 @@ class DiscoveryConfig(TemplateConfig):
     further_objects: int = 36
     """Objects beside them that show how objects of the category stand."""
     further_views: int = 10
-    """Views of each of these."""
+    """Views of each of these, and of those above as many at most when that is asked."""
     contenders: int = 2
     """First templates of each draw, those of least loss, that held-out views judge."""
     finalists: int = 3
@@ -105,11 +105,11 @@ class SearchConfig:
     trusted: float = 0.85
     """Share of those clouds, the most confidently placed, that tell states, cameras and looks, and
     of the placed ones from which the network learns."""
-    placed: int = 2500
+    placed: int = 2000
     """Training clouds in which the template is then searched for as `quick` does, 0.08 s each."""
     rounds: int = 2
     """How often that is done, and the network taught: from the second time on its word counts."""
-    epochs: int = 32
+    epochs: int = 30
     """Epochs of the network in the last round, and twice those of a round before, which has to tell
     no more than how clouds are placed anew."""
     lr: float = 2e-3

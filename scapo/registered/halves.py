@@ -45,7 +45,7 @@ from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
 
-FITTED = 60  # Inliers, at most, that halves are fitted to
+FITTED = 48  # Inliers, at most, that halves are fitted to
 KEPT = (8, 4, 4, 3)
 """Cuts, those that fit best, that are kept after each round of fitting and building anew: which is
 right shows late."""
