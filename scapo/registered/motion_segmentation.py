@@ -25,7 +25,7 @@ from scapo.registered.template import (
     spread_out,
     surface_features,
 )
-from scapo.registered.view_loss import SEEN_WITHIN, match_weight
+from scapo.registered.view_loss import SEEN_WITHIN, match_weight, oriented_nearest
 from scapo.registered.views import PartialViews
 
 OBSERVERS, SETTLED_OBSERVERS = 24, 72
@@ -48,7 +48,10 @@ BASE_BONUS, LEAST_BONUS, LEAST_PART = 0.3, 0.1, 0.05
 """Log support by which the base wins over a part, so that what nothing tells apart stays with it;
 that where it would leave a part with less than this share of the points, and for hinges once
 placements are settled: what lies near a hinge moves little, but turns."""
-SUPPORTED = 0.4  # Share of the views that must agree for a point to enter the template
+SUPPORTED, CONFIRMED = 0.4, 0.3
+"""Share of the views that must agree for a point to enter the template; once placements are
+settled, those that have a point of the same part there: where lids stand open is no body, though
+many views have a lid there and one whose lid was taken for the body agrees with them."""
 SEEN = 0.05  # Share of the observers that must have seen it, or more than one view
 LEAST_GOOD = 50  # Points without which the template stays as it was
 AVERAGED = 0.03
@@ -69,6 +72,8 @@ class Evidence:
     """Logarithm of the share of the views that agree, of those that can tell."""
     seen: Float[Tensor, "B K P"]
     """Number of views that agree."""
+    own: Float[Tensor, "B K P"]
+    """Share of the views that agree with points of the same part, of those that can tell."""
 
 
 @torch.no_grad()
@@ -79,8 +84,18 @@ def gather_evidence(
     *,
     count: int,
     observers: Int[Tensor, " O"],
+    part: Float[Tensor, "B N P"] | None = None,
 ) -> Evidence:
-    """Support of every view's first `count` points, or all, from the `observers` among them."""
+    """Support of every view's first `count` points, or all, from the `observers` among them.
+
+    Args:
+        views: B views of N points.
+        poses: Of the parts in them.
+        log_scale: Of the objects.
+        count: Points of each that are asked about.
+        observers: Which views are asked.
+        part: Which part each point is of; None: any.
+    """
     count = min(count, views.points.shape[1])
     scale = log_scale.exp()
     columns = []
@@ -88,28 +103,30 @@ def gather_evidence(
         turn, move = poses.rotation[:, p], poses.translation[:, p]
         points = (views.points[:, :count] - move[:, None]) @ turn / scale[:, None]
         normals = views.normals[:, :count] @ turn
-        agree, against = points.new_zeros(2, points.shape[0] * count).unbind(0)
+        agree, against, alike = points.new_zeros(3, points.shape[0] * count).unbind(0)
         own = torch.arange(len(points), device=points.device).repeat_interleave(count)
         for o in observers.tolist():
             there = points.flatten(0, 1) * scale[o] @ turn[o].T + move[o]
-            yes, no = _witness(
+            yes, no, met = _witness(
                 take(views, observers.new_tensor([o])), there, normals.flatten(0, 1) @ turn[o].T
             )
             agree = agree + yes * (own != o)
             against = against + no * (own != o)
+            alike = alike + yes * (own != o) * (1.0 if part is None else part[o, met, p])
         log_support = ((agree + PRIOR) / (agree + against + 2 * PRIOR)).log()
         shape = points.shape[:2]
-        columns.append(
-            (points, normals, log_support.unflatten(0, shape), agree.unflatten(0, shape))
-        )
-    points, normals, log_support, seen = (torch.stack(c, 2) for c in zip(*columns, strict=True))
-    return Evidence(points=points, normals=normals, log_support=log_support, seen=seen)
+        share = (alike + PRIOR) / (agree + against + 2 * PRIOR)
+        values = (log_support, agree, share)
+        columns.append((points, normals, *(value.unflatten(0, shape) for value in values)))
+    points, normals, *told = (torch.stack(column, 2) for column in zip(*columns, strict=True))
+    log_support, seen, alike = told
+    return Evidence(points=points, normals=normals, log_support=log_support, seen=seen, own=alike)
 
 
 def _witness(
     view: PartialViews, points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"]
-) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-    """How far one view confirms oriented points, and how far it contradicts them, in [0, 1]."""
+) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"], Int[Tensor, " K"]]:
+    """How far one view confirms and contradicts oriented points, in [0, 1]; by which of its own."""
     target, target_normals = view.points[0], view.normals[0]
     off, index = (target.square().sum(-1) - 2 * points @ target.T).min(-1)
     off = (off + points.square().sum(-1)).clamp_min(0)
@@ -118,7 +135,7 @@ def _witness(
     free, hidden = (mask[0] for mask in view.free_and_hidden(points[None], SEEN_WITHIN))
     faces = (normals * F.normalize(view.camera - points, dim=-1)).sum(-1) > FACING
     missed = (~hidden & ~free & faces).to(yes)
-    return yes, (1 - yes) * (free.to(yes) + MISSED * missed)
+    return yes, (1 - yes) * (free.to(yes) + MISSED * missed), index
 
 
 @torch.no_grad()
@@ -164,12 +181,10 @@ def rebuild(
     count = max(LEAST_COUNT, min(views.points.shape[1], ALL_COUNT // len(views.points)))
     order = torch.randperm(len(views.points), generator=generator, device=generator.device)
     observers = order[: SETTLED_OBSERVERS if settled else OBSERVERS]
+    poses = template.part_poses(placement) if poses is None else poses
+    told = _parts(template, views, template.place(placement, poses)) if settled else None
     evidence = gather_evidence(
-        views,
-        template.part_poses(placement) if poses is None else poses,
-        placement.log_scale,
-        count=count,
-        observers=observers,
+        views, poses, placement.log_scale, count=count, observers=observers, part=told
     )
     score = evidence.log_support - evidence.log_support.mean(-1, keepdim=True)
     score = smooth(views, score)
@@ -182,8 +197,18 @@ def rebuild(
     normals = evidence.normals.gather(2, chosen)[:, :, 0].flatten(0, 1)
     support = evidence.log_support.gather(2, part[..., None])[..., 0].flatten().exp()
     seen = evidence.seen.gather(2, part[..., None])[..., 0].flatten()
-    good = (support > SUPPORTED) & (seen > max(1.0, SEEN * len(observers)))
+    own = evidence.own.gather(2, part[..., None])[..., 0].flatten()
+    good = (own > (CONFIRMED if settled else SUPPORTED)) & (seen > max(1.0, SEEN * len(observers)))
     _resample(template, points, normals, score.flatten(0, 1), support, good)
+
+
+def _parts(
+    template: ArticulatedTemplate,
+    views: PartialViews,
+    placed: tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]],
+) -> Float[Tensor, "B N P"]:
+    """Of the views' points, by the nearest of the template as it is placed."""
+    return template.logit.softmax(-1)[oriented_nearest(views.points, views.normals, *placed)]
 
 
 def favouring_base(

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from scapo.records import cat, map_tensors, pack, take, unpack
+from scapo.records import cat, map_tensors, pack, take, unpack, without_autograd
 from scapo.types import Joints, Labels, Observation, Prediction
 
 
@@ -30,6 +30,21 @@ def test_nested_records_are_followed_and_what_is_withheld_stays_so() -> None:
     assert torch.equal(changed.joints.pivot[2], torch.full((2, 3), 5.0))
     assert changed.camera_T_part is None
     assert map_tensors(Labels(), lambda tensor: tensor + 1) == Labels()
+
+
+def test_autograd_goes_on_with_what_was_made_without_it() -> None:
+    weight = torch.ones(2, 5, 3, requires_grad=True)
+
+    @without_autograd
+    def doubled(given: torch.Tensor) -> Prediction:
+        assert torch.is_inference_mode_enabled()
+        return Prediction(part_weight=2 * given)
+
+    made = doubled(weight).part_weight
+    assert not made.requires_grad
+    assert not made.is_inference()
+    (made * weight).sum().backward()  # saved for the backward pass
+    assert torch.equal(weight.grad, torch.full_like(weight, 2.0))
 
 
 def test_mappings_and_tuples_are_followed() -> None:

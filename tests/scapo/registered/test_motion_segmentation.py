@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from scapo.registered.motion_segmentation import (
@@ -89,6 +91,24 @@ def test_settled_placements_tell_what_lies_near_a_hinge():
         index = torch.cdist(good.points[strip], shape.points).argmin(1)
         kept.append(float((shape.logit.argmax(-1)[index] == 1).float().mean()))
     assert kept[1] > kept[0] + 0.05
+
+
+@torch.no_grad()
+def test_what_only_flaps_leave_there_is_no_surface_of_the_base():
+    """A view that is placed with a wrong state takes its flap for the base's; others' are there."""
+    views, truth = sighted(24, seed=22)
+    state = truth.state.clone()
+    state[::4] = 0.0
+    wrong = replace(truth, state=state)
+    good = template(seed=5, count=3000)
+    base = good.points[good.logit.argmax(-1) == 0]
+    strays = []
+    for settled in (False, True):
+        shape = template()
+        rebuild(shape, views, wrong, settled=settled, generator=generator(2))
+        own = shape.points[shape.logit.argmax(-1) == 0]
+        strays.append(int((torch.cdist(own, base).amin(1) > 0.06).sum()))
+    assert strays[1] < strays[0] / 2
 
 
 def test_a_part_is_one_piece():
