@@ -337,5 +337,5 @@ def test_a_model_that_knows_no_camera_cannot_be_shown_whole_surfaces() -> None:
         other.pseudo.load_state_dict(method.pseudo.state_dict())
         if isinstance(other.network, ViewNetwork):
             other.network.learned.fill_(learned)
-        with pytest.raises(ValueError, match="mode whole: expected a model whose network learned"):
+        with pytest.raises(ValueError, match="mode whole: expected a network that learned"):
             other.predict(observation, "whole")
