@@ -351,10 +351,13 @@ def _or_in_halves(
         return _advance_alone(chosen, searched, config.trusted[-1], config, course)
 
     tried = [best, course.step("two halves", halved)]
+    if not are_halves(tried[1].template):
+        logger.info("no two halves that are alike")
+        return best
     judged = partial(_dense_losses, tried, judges, config, course)
     was, now = course.step("judging halves", judged)
     logger.info("template as it is and in two halves judged: %.3f %.3f", was, now)
-    return tried[now < was and are_halves(tried[1].template)]
+    return tried[now < was]
 
 
 def _dense_losses(
