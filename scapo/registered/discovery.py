@@ -23,8 +23,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from scapo.categories import JointKind
 from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
@@ -36,6 +34,7 @@ from scapo.registered.course import JUDGES, Course, are_alike, numbered, plan_of
 from scapo.registered.halves import are_halves, in_halves, may_have_halves
 from scapo.registered.initialisation import common_frame, fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
+from scapo.registered.mirror_images import mirrored, paired
 from scapo.registered.object_frames import all_views, taught_by_objects
 from scapo.registered.objects import (
     AGREEING,
@@ -57,7 +56,7 @@ from scapo.registered.pose_search import (
     search_views,
     unexplained,
 )
-from scapo.registered.template import SPAN, ArticulatedTemplate, spread_out, surface_features
+from scapo.registered.template import ArticulatedTemplate
 from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
@@ -379,78 +378,3 @@ def _dense_loss(
     one: Candidate, judges: PartialViews, config: DiscoveryConfig, generator: torch.Generator
 ) -> float:
     return unexplained(densified(one, config, generator), judges, config)
-
-
-@torch.no_grad()
-def mirrored(template: ArticulatedTemplate, axis: int) -> ArticulatedTemplate:
-    """The template with the mirror image of its base added, with as many points as before.
-
-    Args:
-        template: Its parts and joints stay.
-        axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
-    """
-    base = template.logit.argmax(-1) == 0
-    image = _reflected(template, template.points[base], axis)
-    return _with_surface(
-        template,
-        torch.cat([template.points, image]),
-        torch.cat([template.normals, template.normals[base] * _across(template, axis)]),
-        torch.cat([template.logit, template.logit[base]]),
-    )
-
-
-@torch.no_grad()
-def paired(candidate: Candidate, joint: int, axis: int) -> Candidate:
-    """The candidate with the mirror image of one part, and of its joint, in place of the other.
-
-    Args:
-        candidate: Of two joints of one kind.
-        joint: Whose part is mirrored.
-        axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
-    """
-    template, other = candidate.template, 1 - joint
-    part, swapped = template.logit.argmax(-1), [0, 2, 1]
-    own, kept, across = part == joint + 1, part != other + 1, _across(template, axis)
-    made = _with_surface(
-        template,
-        torch.cat([template.points[kept], _reflected(template, template.points[own], axis)]),
-        torch.cat([template.normals[kept], template.normals[own] * across]),
-        torch.cat([template.logit[kept], template.logit[own][:, swapped]]),
-    )
-    made.pivot[other] = _reflected(template, template.pivot[joint, None], axis)[0]
-    way = -1.0 if template.kinds[joint] == "revolute" else 1.0  # turns are mirrored the other way
-    made.axis[other] = way * template.axis[joint] * across
-    placement = candidate.inliers.placement
-    state, shift = placement.state.clone(), placement.shift.clone()
-    state[:, other] = state[:, joint].roll(1)  # states that occur, of other views
-    shift[:, other] = 0
-    inliers = replace(candidate.inliers, placement=replace(placement, state=state, shift=shift))
-    return replace(candidate, template=made, inliers=inliers)
-
-
-def _with_surface(
-    template: ArticulatedTemplate,
-    points: Float[Tensor, "M 3"],
-    normals: Float[Tensor, "M 3"],
-    logit: Float[Tensor, "M P"],
-) -> ArticulatedTemplate:
-    """Another template of these points, as many as it has, spread out."""
-    index = spread_out(surface_features(points, normals, logit.softmax(-1)), len(template.points))
-    made = template.with_points(len(index))
-    made.assign(points[index], normals[index], logit[index])
-    return made
-
-
-def _across(template: ArticulatedTemplate, axis: int) -> Float[Tensor, " 3"]:
-    return 1 - 2 * torch.eye(3).to(template.points)[axis]
-
-
-def _reflected(
-    template: ArticulatedTemplate, points: Float[Tensor, "K 3"], axis: int
-) -> Float[Tensor, "K 3"]:
-    """Mirror images through the middle of the base."""
-    base = template.points[template.logit.argmax(-1) == 0]
-    if not len(base):
-        return points
-    ends = base[:, axis].quantile(torch.tensor(SPAN).to(base)).sum()
-    return points * _across(template, axis) + ends * torch.eye(3).to(base)[axis]

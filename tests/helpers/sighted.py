@@ -55,6 +55,15 @@ def template(seed: int = 0, count: int = 400) -> ArticulatedTemplate:
     return made
 
 
+def without_a_side() -> ArticulatedTemplate:
+    """The box with its flap, but without its side at positive y."""
+    whole = template(count=500)
+    kept = (whole.normals[:, 1] < 0.8) | (whole.logit.argmax(-1) == 1)
+    cut = whole.with_points(400)
+    cut.assign(whole.points[kept][:400], whole.normals[kept][:400], whole.logit[kept][:400])
+    return cut
+
+
 def sighted(count: int, seed: int = 0, deviation: float = 0.0) -> tuple[PartialViews, Placement]:
     """Views of the object from about one side, at states 0 to 1, with their true placements.
 
