@@ -104,7 +104,7 @@ REGISTERED = Entry(
     seeds=THREE,
     parts=("clean", "sensor"),
     modes=("fast", "quick", "refine"),
-    training=2500,
+    training=1300,
     seconds={"fast": 0.05, "quick": 0.06, "refine": 0.35},
 )
 RELEASED = replace(REGISTERED, name="released", seeds=(1,), training=0,

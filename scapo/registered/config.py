@@ -181,7 +181,7 @@ class RegisteredConfig(SearchConfig):
 
 
 def cpu_config() -> RegisteredConfig:
-    """Trains one category in 22 minutes or less on two cores."""
+    """Trains one category in about ten minutes on two idle cores."""
     return RegisteredConfig()
 
 
