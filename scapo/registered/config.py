@@ -54,7 +54,7 @@ class DiscoveryConfig(TemplateConfig):
     further_objects: int = 36
     """Objects beside them that show how objects of the category stand."""
     further_views: int = 10
-    """Views of each of these, and of those above as many at most when that is asked."""
+    """Views of each of these."""
     contenders: int = 2
     """First templates of each draw, those of least loss, that held-out views judge."""
     finalists: int = 3

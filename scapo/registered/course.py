@@ -90,7 +90,7 @@ def plan_of(
     if objects:
         pairs = comb(config.further_views, 2) * PAIR * config.rotations / GRID
         plan |= dict.fromkeys(numbered("further object", further), pairs)
-        shown = (objects + further) * config.further_views
+        shown = objects * config.object_views + further * config.further_views
         plan["search of objects"] = VIEW * AGREEING * shown
         plan["how objects stand"] = OBJECT_VIEW * AGREEING * shown
     plan["search of all views"] = VIEW * views

@@ -195,8 +195,7 @@ def _how_objects_stand(
         name: partial(common_frame, views, config.rotations, AGREEING, OWN_HIDDEN_COST)
         for name, views in zip(names, further, strict=True)
     }
-    some = [take(x.posed, evenly(len(x.posed.rotation), config.further_views)) for x in known]
-    owned = all_views([*some, *course.steps(jobs)])
+    owned = all_views([*(one.posed for one in known), *course.steps(jobs)])
     searching = partial(search_near, best, owned.views, journal=course.journal)
     hypotheses, kinds = course.step("search of objects", searching), best.template.kinds
     taught = partial(taught_by_objects, known, kinds, owned, hypotheses, course.generator)
