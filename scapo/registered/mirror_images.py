@@ -16,6 +16,7 @@ from torch import Tensor
 
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.registered.bundle_adjustment import Candidate
+from scapo.registered.motion_segmentation import TAKEN
 from scapo.registered.template import SPAN, ArticulatedTemplate, spread_out, surface_features
 
 MIDDLES = 200  # States of a part among which is sought where it lies in the mirror plane
@@ -42,22 +43,25 @@ def mirrored(template: ArticulatedTemplate, axis: int) -> ArticulatedTemplate:
 
 
 @torch.no_grad()
-def paired(candidate: Candidate, joint: int, axis: int) -> Candidate:
+def paired(candidate: Candidate, joint: int, axis: int, *, body: bool = False) -> Candidate:
     """The candidate with the mirror image of one part, and of its joint, in place of the other.
 
     Args:
         candidate: Of two joints of one kind.
         joint: Whose part is mirrored.
         axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
+        body: Whether the other is left to the base, a piece of which it was.
     """
     template, other = candidate.template, 1 - joint
     part, swapped = template.logit.argmax(-1), [0, 2, 1]
-    own, kept, across = part == joint + 1, part != other + 1, _across(template, axis)
+    own, lost, across = part == joint + 1, part == other + 1, _across(template, axis)
+    kept, logit = ~lost | body, template.logit.clone()
+    logit[lost, 0] = logit[lost].amax(-1) + TAKEN
     made = _with_surface(
         template,
         torch.cat([template.points[kept], _reflected(template, template.points[own], axis)]),
         torch.cat([template.normals[kept], template.normals[own] * across]),
-        torch.cat([template.logit[kept], template.logit[own][:, swapped]]),
+        torch.cat([logit[kept], logit[own][:, swapped]]),
     )
     made.pivot[other] = _reflected(template, template.pivot[joint, None], axis)[0]
     way = -1.0 if template.kinds[joint] == "revolute" else 1.0  # turns are mirrored the other way

@@ -100,6 +100,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         "unexplained": lambda one, *_: float(one.template.pivot.detach().sum()),
         "densified": lambda one, _, g, *more: advancing(copied(one), g),
         "in_halves": halved,
+        "are_halves": lambda _: True,
         "with_axis_deviation": lambda one, _, __, g, ___: advancing(copied(one), g),
         "advance": advancing,
         "_advance_alone": lambda one, *x: advancing(one, x[-1].generator),

@@ -98,6 +98,21 @@ def test_a_part_that_was_taken_for_two_is_told_to_its_own_side() -> None:
     assert (other > 0.5).all()
 
 
+def test_the_other_may_have_been_a_piece_of_the_base() -> None:
+    """Its points are left to it, or are gone."""
+    shape, still = (
+        handles(),
+        Placement.at(torch.eye(3).expand(4, 3, 3), torch.zeros(4, 3), torch.zeros(4, 2)),
+    )
+    views, _ = sighted(4, seed=3)
+    start = Candidate(template=shape, inliers=Inliers(views=views, placement=still))
+    for body in (False, True):
+        made = paired(start, 0, 0, body=body).template
+        there = (made.points == 0).all(-1)
+        assert bool(there.any()) == body
+        assert (made.logit.argmax(-1)[there] == 0).all()
+
+
 def test_a_part_that_keeps_to_its_side_stays_as_it_was() -> None:
     said = torch.tensor([0.9, 0.5, 0.7, 0.8, 0.3, 1.1, -0.1, 0.6])
     own, other = divided(handles(), said, 0, 0)
