@@ -75,8 +75,8 @@ def plan_of(
     plan["judging templates"] = judged * left * (left > 1)
     rounds = numbered("round", len(config.trusted))
     if config.mirror and rounds:
-        images = 4 + 2 * are_alike(kinds)
-        plan |= {"judging pairs of parts": 12 * judged} if are_alike(kinds) else {}
+        images = 4 + are_alike(kinds)
+        plan |= {"judging pairs of parts": 6 * judged} if are_alike(kinds) else {}
         plan |= {f"{rounds[0]}, {one}": half for one in numbered("mirror image", images)}
         plan["judging mirror images"] = images * (DENSE + judged)
         rounds = rounds[1:]

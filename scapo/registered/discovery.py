@@ -21,7 +21,6 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 
 import torch
 
@@ -306,17 +305,14 @@ def completed(
     rebuilt from views, which leaves out what no view saw, and all with dense templates: of two
     sparse ones that with more surface is the coarser, which costs more than a side that is missing.
     Views of such a side were turned until they looked like others: for their round cameras are
-    sought anywhere. Of the mirror images of either part that goes on which explains views best at
-    once; where one part was found and the other was not, nothing tells at once which.
+    sought anywhere. Of mirror images of a part that goes on which explains the views best at once.
     """
     wholes = [replace(candidate, template=mirrored(candidate.template, axis)) for axis in range(3)]
     first, several = numbered("round", len(config.trusted))[0], [candidate, *wholes]
     if are_alike(candidate.template.kinds):
-        ways = list(product(range(2), range(3), (False, True)))
-        pairs = [paired(candidate, joint, axis, body=body) for joint, axis, body in ways]
+        pairs = [paired(candidate, joint, axis) for joint in range(2) for axis in range(3)]
         judging = partial(ranked, pairs, judges, config, course.journal)
-        order = course.step("judging pairs of parts", judging)
-        several += [pairs[next(k for k in order if ways[k][0] == joint)] for joint in range(2)]
+        several.append(pairs[course.step("judging pairs of parts", judging)[0]])
     names = [f"{first}, {one}" for one in numbered("mirror image", len(several))]
     own, jobs = own_generators(course.generator, len(names)), dict[str, Callable[[], Candidate]]()
     for name, one, generator in zip(names, several, own, strict=True):

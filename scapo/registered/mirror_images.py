@@ -11,17 +11,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.registered.bundle_adjustment import Candidate
-from scapo.registered.motion_segmentation import TAKEN
 from scapo.registered.template import SPAN, ArticulatedTemplate, spread_out, surface_features
-
-MIDDLES = 200  # States of a part among which is sought where it lies in the mirror plane
-BEYOND = 0.15
-"""Share of the views, at least, in which a part lies beyond that plane that was taken for two."""
 
 
 @torch.no_grad()
@@ -43,79 +37,32 @@ def mirrored(template: ArticulatedTemplate, axis: int) -> ArticulatedTemplate:
 
 
 @torch.no_grad()
-def paired(candidate: Candidate, joint: int, axis: int, *, body: bool = False) -> Candidate:
+def paired(candidate: Candidate, joint: int, axis: int) -> Candidate:
     """The candidate with the mirror image of one part, and of its joint, in place of the other.
 
     Args:
         candidate: Of two joints of one kind.
         joint: Whose part is mirrored.
         axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
-        body: Whether the other is left to the base, a piece of which it was.
     """
     template, other = candidate.template, 1 - joint
     part, swapped = template.logit.argmax(-1), [0, 2, 1]
-    own, lost, across = part == joint + 1, part == other + 1, _across(template, axis)
-    kept, logit = ~lost | body, template.logit.clone()
-    logit[lost, 0] = logit[lost].amax(-1) + TAKEN
+    own, kept, across = part == joint + 1, part != other + 1, _across(template, axis)
     made = _with_surface(
         template,
         torch.cat([template.points[kept], _reflected(template, template.points[own], axis)]),
         torch.cat([template.normals[kept], template.normals[own] * across]),
-        torch.cat([logit[kept], logit[own][:, swapped]]),
+        torch.cat([template.logit[kept], template.logit[own][:, swapped]]),
     )
     made.pivot[other] = _reflected(template, template.pivot[joint, None], axis)[0]
     way = -1.0 if template.kinds[joint] == "revolute" else 1.0  # turns are mirrored the other way
     made.axis[other] = way * template.axis[joint] * across
     placement = candidate.inliers.placement
     state, shift = placement.state.clone(), placement.shift.clone()
-    state[:, joint], state[:, other] = divided(template, state[:, joint], joint, axis)
+    state[:, other] = state[:, joint].roll(1)  # states that occur, of other views
     shift[:, other] = 0
     inliers = replace(candidate.inliers, placement=replace(placement, state=state, shift=shift))
     return replace(candidate, template=made, inliers=inliers)
-
-
-@torch.no_grad()
-def divided(
-    template: ArticulatedTemplate, state: Float[Tensor, " B"], joint: int, axis: int
-) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
-    """States of a part, and of its mirror image, where it may have been taken for both.
-
-    Two handles that meet in the middle are alike: one that explains either leaves nothing to the
-    other, and goes twice as far. Where it lies beyond the mirror plane it was the other, turned
-    likewise to its own side. What a view does not tell are states of other views.
-
-    Args:
-        template: Before there is the mirror image.
-        state: Of the part in B views.
-        joint: That moves it.
-        axis: Of the template's frame, normal of the plane (`SPAN`).
-    """
-    if template.kinds[joint] == "prismatic":
-        return state, state.roll(1)
-    part = template.points[template.logit.argmax(-1) == joint + 1]
-    if not len(part):
-        return state, state.roll(1)
-    arm = (part - template.pivot[joint]).mean(0)
-    tried = torch.cat([state, torch.linspace(float(state.min()), float(state.max()), MIDDLES)])
-    turn = rotvec_to_rotmat(template.directions()[joint] * tried[:, None])
-    centre = template.pivot[joint] + (turn @ arm[:, None])[..., 0]
-    off = (centre - _reflected(template, centre, axis))[:, axis]
-    side, grid = off[: len(state)], off[len(state) :]
-    beyond = side * side.median() < 0
-    if float(beyond.float().mean()) < BEYOND:
-        return state, state.roll(1)
-    middle = tried[len(state) :][grid.abs().argmin()]
-    own, others = state[~beyond], 2 * middle - state[beyond]
-    return _filled(state, ~beyond, own), _filled(state, beyond, others)
-
-
-def _filled(
-    like: Float[Tensor, " B"], rows: Bool[Tensor, " B"], known: Float[Tensor, " K"]
-) -> Float[Tensor, " B"]:
-    """What is known in some rows, and in the others what others know, in turn."""
-    made = known[torch.arange(len(like)) % len(known)]
-    made[rows] = known
-    return made
 
 
 def _with_surface(

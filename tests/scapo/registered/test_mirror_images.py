@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mirror images of bases and of parts: where they lie, and which states views then have."""
+"""Mirror images of bases and of parts lie where they should."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 from scapo.categories import JointKind
 from scapo.registered.bundle_adjustment import Candidate, Inliers
-from scapo.registered.mirror_images import divided, mirrored, paired
+from scapo.registered.mirror_images import mirrored, paired
 from scapo.registered.template import ArticulatedTemplate, Placement
 from tests.helpers.sighted import sighted, without_a_side
 from tests.helpers.strategies import generator
@@ -67,54 +67,3 @@ def test_one_part_is_mirrored_in_place_of_the_other(joint: int, kind: JointKind)
     turned = facing[0, of == joint + 1][nearest]
     assert torch.allclose(facing[0, of == other + 1] * mirror, turned, atol=1e-4)
     assert torch.equal(found.inliers.placement.state, still.state)
-
-
-def handles() -> ArticulatedTemplate:
-    """A box, a handle that stands upright in its middle and turns about y, and hardly another."""
-    g = generator(5)
-    box = (torch.rand(50, 3, generator=g) - 0.5) * torch.tensor([0.6, 0.4, 0.2])
-    box = torch.cat([box, box * torch.tensor([-1.0, 1.0, 1.0])])
-    handle = torch.rand(50, 3, generator=g) * torch.tensor([0.02, 0.4, 0.3]) - torch.tensor(
-        [0.01, 0.2, 0]
-    )
-    shape = ArticulatedTemplate(("revolute", "revolute"), 160)
-    part = torch.tensor([0, 1, 2]).repeat_interleave(torch.tensor([100, 50, 10]))
-    points = torch.cat([box, handle, torch.zeros(10, 3)])
-    shape.assign(points, torch.ones(160, 3) / 3**0.5, 9.0 * torch.eye(3)[part])
-    with torch.no_grad():
-        shape.axis.copy_(torch.tensor([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]))
-        shape.pivot[0] = torch.tensor([0.0, 0.0, 0.0])
-    return shape
-
-
-def test_a_part_that_was_taken_for_two_is_told_to_its_own_side() -> None:
-    """Positive states lie at positive x, mostly; what lies at negative x was the other one."""
-    said = torch.tensor([0.9, 0.5, -0.7, 0.8, 0.3, -1.1, 1.2, 0.6])
-    own, other = divided(handles(), said, 0, 0)
-    beyond = said < 0
-    assert torch.equal(own[~beyond], said[~beyond])
-    assert set(own[beyond].tolist()) <= set(said[~beyond].tolist())
-    torch.testing.assert_close(other[beyond], -said[beyond], atol=0.04, rtol=0)
-    assert (other > 0.5).all()
-
-
-def test_the_other_may_have_been_a_piece_of_the_base() -> None:
-    """Its points are left to it, or are gone."""
-    shape, still = (
-        handles(),
-        Placement.at(torch.eye(3).expand(4, 3, 3), torch.zeros(4, 3), torch.zeros(4, 2)),
-    )
-    views, _ = sighted(4, seed=3)
-    start = Candidate(template=shape, inliers=Inliers(views=views, placement=still))
-    for body in (False, True):
-        made = paired(start, 0, 0, body=body).template
-        there = (made.points == 0).all(-1)
-        assert bool(there.any()) == body
-        assert (made.logit.argmax(-1)[there] == 0).all()
-
-
-def test_a_part_that_keeps_to_its_side_stays_as_it_was() -> None:
-    said = torch.tensor([0.9, 0.5, 0.7, 0.8, 0.3, 1.1, -0.1, 0.6])
-    own, other = divided(handles(), said, 0, 0)
-    assert torch.equal(own, said)
-    assert torch.equal(other, said.roll(1))
