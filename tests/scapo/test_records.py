@@ -44,6 +44,7 @@ def test_autograd_goes_on_with_what_was_made_without_it() -> None:
     assert not made.requires_grad
     assert not made.is_inference()
     (made * weight).sum().backward()  # saved for the backward pass
+    assert weight.grad is not None
     assert torch.equal(weight.grad, torch.full_like(weight, 2.0))
 
 
