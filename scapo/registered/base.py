@@ -330,7 +330,7 @@ class AbstractRegistered(AbstractMethod):
             ValueError: A model without a network that knows cameras.
         """
         if isinstance(self.network, PointVotes) or not self._has_learned():
-            raise ValueError("mode whole: expected a network that learned known cameras, has none")
+            raise ValueError("mode whole: expected a network that learned cameras, found none")
         clouds, similarity = normalise(observation.points)
         away = float(self.pseudo.camera[self.pseudo.trust > 0].norm(dim=1).median())
         placement, sure = lying(self.template, self._of_view, away, clouds)

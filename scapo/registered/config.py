@@ -181,7 +181,7 @@ class RegisteredConfig(SearchConfig):
 
 
 def cpu_config() -> RegisteredConfig:
-    """Trains one category in about ten minutes on two idle cores."""
+    """Trains one category in 10 to 14 minutes on two cores."""
     return RegisteredConfig()
 
 

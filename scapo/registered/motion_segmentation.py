@@ -116,11 +116,12 @@ def gather_evidence(
         log_support = ((agree + PRIOR) / (agree + against + 2 * PRIOR)).log()
         shape = points.shape[:2]
         share = (alike + PRIOR) / (agree + against + 2 * PRIOR)
-        values = (log_support, agree, share)
-        columns.append((points, normals, *(value.unflatten(0, shape) for value in values)))
-    points, normals, *told = (torch.stack(column, 2) for column in zip(*columns, strict=True))
-    log_support, seen, alike = told
-    return Evidence(points=points, normals=normals, log_support=log_support, seen=seen, own=alike)
+        told = (value.unflatten(0, shape) for value in (log_support, agree, share))
+        columns.append((points, normals, *told))
+    points, normals, log_support, seen, own = (
+        torch.stack(column, 2) for column in zip(*columns, strict=True)
+    )
+    return Evidence(points=points, normals=normals, log_support=log_support, seen=seen, own=own)
 
 
 def _witness(
@@ -175,7 +176,7 @@ def rebuild(
         placement: Theirs.
         poses: Of the parts, if they are not as placed.
         settled: Whether placements are near their end: more views are asked, hinged parts have
-            what tells little.
+            what tells little, and only points of the same part confirm one another.
         generator: Draws the observers.
     """
     count = max(LEAST_COUNT, min(views.points.shape[1], ALL_COUNT // len(views.points)))
