@@ -3,23 +3,25 @@
 
 Views of one object are registered with one another; so all of them say together how it stands. The
 hypotheses of single views leave a few ways open for each object, and the loss alone takes a wrong
-one for objects that are less like the template. Two things know better that err elsewhere: how the
-objects themselves agree (`objects.agreeing`: cameras, axes, which way parts lie), and what those
-objects look like whose way is sure (`orientation`). Objects on which the loss and the objects agree
-teach first; in each round more are added, those that are surest, each judged by a network that has
-not seen it. Where the loss was right and objects look alike after a quarter turn, mistakes confirm
-themselves; so objects teach only where views of those that a network has not seen then stand as
-these do more often than by the loss alone.
+one for objects that are less like the template. Two things know better: how the objects themselves
+agree (`objects.agreeing`: cameras, axes, which way parts lie), and what those objects look like
+whose way is sure (`orientation`). The objects on which all agree teach first; in each round others
+do, the surest, each judged by a network that has not seen it.
+
+Where views of two sides of an object were taken for one side, its frame is wrong, and its cameras
+gather. So objects teach only where their cameras are spread nearly as widely as those of single
+views are: of drawers 0.87, of washers, on which views know better, 0.47.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from scapo.categories import JointKind
@@ -35,20 +37,15 @@ logger = logging.getLogger(__name__)
 
 WAYS, ASIDE = 8, 40.0
 """Ways of an object that are told apart at most, and the degrees between them at least."""
-LOSS_VOTE, CONSENSUS = 3.0, 0.5
+LOSS_VOTE, CONSENSUS = 0.5, 1.0
 """Nats that all hypotheses of an object are worth which agree with a way, and that a way is which
 the objects' consensus takes."""
 AGREED = 35.0  # Degrees from the consensus within which a way is the one that it takes
-TAUGHT = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-"""Share of the objects, the surest, that teach; the first where none agree."""
+TAUGHT = (0.5, 0.7, 0.9)  # Share of the objects, the surest, that teach after each round
 FOLDS = 3  # Parts of the objects, each judged by a network that learned from the others
 LEAST_NATS = -4.0  # What a view can hold against a way at most
 SURE_NATS = 9.0  # Lead of a way that has no rival
-NEAR, LEAST_VOTE = 30.0, 0.1
-"""Degrees from its object's way within which a hypothesis of a view says the same, and its vote
-over that of the view's best one with which it may be so: other views were registered wrongly."""
-LEAST_GAIN = 0.07
-"""Share of the views that must come to stand as their objects do: drawers 0.09, washers 0.05."""
+LEAST_SPREAD = 0.7  # Variance of an object's cameras against single views' with which objects teach
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,26 +85,22 @@ def taught_by_objects(
         generator: On the host.
     """
     learner = _Learner(owned, hypotheses, generator)
+    spread = learner.spread()
+    logger.info("cameras of objects spread %.2f as widely as those of single views", spread)
+    if spread < LEAST_SPREAD:
+        return None
     turns = torch.stack([reading.turn for reading in agreeing(known, kinds)])
-    taken = consensus(learner.ways, turns)
+    learner.ways, taken = read_alike(learner.ways, turns)
     prior = [
         LOSS_VOTE * way.share + CONSENSUS * own
         for way, own in zip(learner.ways, taken, strict=True)
     ]
-    agreed = torch.tensor([bool(own[0] > 0) for own in taken])
-    teach = agreed if int(agreed.sum()) >= LEAST_OBJECTS else surest(prior, TAUGHT[0])
-    nats = prior
-    for share in TAUGHT[1:]:
-        judged = learner.judged([int(one.argmax()) for one in nats], teach)
+    nats, teach = prior, torch.tensor([bool(own.any()) for own in taken])
+    for share in TAUGHT:
+        judged = learner.judged(nats, teach)
         nats = [one + more for one, more in zip(prior, judged, strict=True)]
         teach = surest(nats, share)
-    chosen = [int(one.argmax()) for one in nats]
-    gain = learner.gain(chosen, teach)
-    logger.info(
-        "%d of %d objects agree how they stand; taught by them %+.1f %% of their views stand so",
-        int(agreed.sum()), len(known), 100 * gain,
-    )  # fmt: skip
-    return learner.taught(chosen, teach) if gain >= LEAST_GAIN else None
+    return learner.taught(nats, teach)
 
 
 @torch.no_grad()
@@ -130,8 +123,12 @@ def ways_of(frames: Float[Tensor, "V F 3 3"], vote: Float[Tensor, "V F"]) -> Way
     return Ways(frame=torch.stack(found)[order], share=torch.stack(shares)[order])
 
 
-def consensus(ways: Sequence[Ways], turns: Float[Tensor, "O 3 3"]) -> list[Float[Tensor, " _"]]:
-    """1 for each way of an object that the consensus of the first O objects takes, 0 for others.
+def read_alike(
+    ways: Sequence[Ways], turns: Float[Tensor, "O 3 3"]
+) -> tuple[list[Ways], list[Float[Tensor, " _"]]]:
+    """The ways, and 1 for each that the consensus of the first O objects takes, 0 for others.
+
+    Of those objects that have no such way it is added.
 
     Args:
         ways: Of all objects.
@@ -139,11 +136,14 @@ def consensus(ways: Sequence[Ways], turns: Float[Tensor, "O 3 3"]) -> list[Float
     """
     first = torch.stack([turn @ way.frame[0] for turn, way in zip(turns, ways, strict=False)])
     frame, _ = densest(first, torch.ones(len(first)))
-    taken = [torch.zeros_like(way.share) for way in ways]
-    for k, turn in enumerate(turns):
-        trace = (turn @ ways[k].frame * frame).sum((-1, -2))
-        taken[k] = within(trace, AGREED).to(trace)
-    return taken
+    every, taken = list(ways), [torch.zeros_like(way.share) for way in ways]
+    for k, wanted in enumerate(turns.mT @ frame):
+        near = within((every[k].frame * wanted).sum((-1, -2)), AGREED)
+        if not bool(near.any()):
+            more = Ways(frame=wanted[None], share=torch.zeros(1))
+            every[k], near = cat([every[k], more]), F.pad(near, (0, 1), value=True)
+        taken[k] = near.float()
+    return every, taken
 
 
 def surest(nats: Sequence[Float[Tensor, " _"]], share: float) -> Bool[Tensor, " O"]:
@@ -164,69 +164,46 @@ class _Learner:
         self, owned: OwnedViews, hypotheses: Hypotheses, generator: torch.Generator
     ) -> None:
         self.owned, self.generator = owned, generator
-        self.loss = hypotheses.loss + hypotheses.unlike
-        self.rotation = hypotheses.placement.rotation.unflatten(0, self.loss.shape)
-        self.vote = torch.softmax(-VOTE * self.loss, 1)
+        loss = hypotheses.loss + hypotheses.unlike
+        rotation = hypotheses.placement.rotation.unflatten(0, loss.shape)
+        vote = torch.softmax(-VOTE * loss, 1)
+        best = torch.gather(rotation, 1, loss.argmin(1)[:, None, None, None].expand(-1, 1, 3, 3))
+        self.alone = best[:, 0]
+        """view_R_template of single views."""
         self.rows = [(owned.owner == k).nonzero()[:, 0] for k in range(int(owned.owner.max()) + 1)]
         self.ways = [
-            ways_of(owned.rotation[own].mT[:, None] @ self.rotation[own], self.vote[own])
-            for own in self.rows
+            ways_of(owned.rotation[own].mT[:, None] @ rotation[own], vote[own]) for own in self.rows
         ]
 
-    def taught(self, chosen: Sequence[int], teach: Bool[Tensor, " O"]) -> OrientationScorer:
-        """The scorer after these objects with these ways."""
-        shown = [self._standing(k, chosen[k]) for k in teach.nonzero()[:, 0].tolist()]
-        rows, rotation = (torch.cat(found) for found in zip(*shown, strict=True))
+    def spread(self) -> float:
+        """Variance of cameras about their objects, against that of single views."""
+        direction = self.owned.views.direction()[..., None]
+        alone = (self.alone.mT @ direction)[..., 0].var(0).sum()
+        about = (self.owned.rotation.mT @ direction)[..., 0]
+        own = torch.stack([about[rows].var(0).sum() for rows in self.rows])
+        return float(own.mean() / alone)
+
+    def taught(
+        self, nats: Sequence[Float[Tensor, " _"]], teach: Bool[Tensor, " O"]
+    ) -> OrientationScorer:
+        """The scorer after these objects, which stand in the likeliest of their ways."""
+        way = [own.frame[one.argmax()] for own, one in zip(self.ways, nats, strict=True)]
+        rotation = self.owned.rotation @ torch.stack(way)[self.owned.owner]
+        rows = teach[self.owned.owner].nonzero()[:, 0]
         views = take(self.owned.views, rows)
-        return OrientationScorer().learn(views, rotation, self.generator)
+        return OrientationScorer().learn(views, rotation[rows], self.generator)
 
     @torch.no_grad()
-    def judged(self, chosen: Sequence[int], teach: Bool[Tensor, " O"]) -> list[Float[Tensor, " _"]]:
+    def judged(
+        self, nats: Sequence[Float[Tensor, " _"]], teach: Bool[Tensor, " O"]
+    ) -> list[Float[Tensor, " _"]]:
         """Mean nats of each way of each object, by a scorer that learned from others."""
-        nats = [torch.zeros_like(way.share) for way in self.ways]
-        for held, scorer in self._held_out(chosen, teach):
-            for k in held:
+        order, found = torch.randperm(len(teach), generator=self.generator), list(nats)
+        for held in (order[k::FOLDS] for k in range(FOLDS)):
+            others = teach.index_fill(0, held, False)
+            scorer = self.taught(nats, others if bool(others.any()) else teach)
+            for k in held.tolist():
                 frame = self.owned.rotation[self.rows[k]][:, None] @ self.ways[k].frame
                 score = scorer(take(self.owned.views, self.rows[k]), frame)
-                nats[k] = score.log_softmax(-1).clamp_min(LEAST_NATS).mean(0)
-        return nats
-
-    @torch.no_grad()
-    def gain(self, chosen: Sequence[int], teach: Bool[Tensor, " O"]) -> float:
-        """Share of views that come to stand as their objects by a scorer that learned from others.
-
-        Less those that do no longer.
-        """
-        count = torch.zeros(())
-        for held, scorer in self._held_out(chosen, teach):
-            for k in held:
-                rows = self.rows[k]
-                near, loss = self._near(k, chosen[k]).float(), self.loss[rows]
-                charged = loss + scorer.charge(take(self.owned.views, rows), self.rotation[rows])
-                was, now = (near.gather(1, x.argmin(1, keepdim=True)) for x in (loss, charged))
-                count += (now - was).sum()
-        return float(count) / len(self.loss)
-
-    def _held_out(
-        self, chosen: Sequence[int], teach: Bool[Tensor, " O"]
-    ) -> Iterator[tuple[list[int], OrientationScorer]]:
-        """Objects in folds, and what the others taught a scorer."""
-        order = torch.randperm(len(self.rows), generator=self.generator)
-        for held in (order[k::FOLDS] for k in range(FOLDS)):
-            others = teach.clone().index_fill(0, held, False)
-            yield held.tolist(), self.taught(chosen, others if bool(others.any()) else teach)
-
-    def _near(self, number: int, way: int) -> Bool[Tensor, "V F"]:
-        """Which hypotheses of an object's views stand as the object does."""
-        rows = self.rows[number]
-        frame = self.owned.rotation[rows] @ self.ways[number].frame[way]
-        return within((self.rotation[rows] * frame[:, None]).sum((-1, -2)), NEAR)
-
-    def _standing(self, number: int, way: int) -> tuple[Int[Tensor, " V"], Float[Tensor, "V 3 3"]]:
-        """Views of an object that may stand as it does, one at least, and their own turns then."""
-        rows = self.rows[number]
-        near = torch.where(self._near(number, way), self.vote[rows], 0.0)
-        vote, best = near.max(1)
-        relative = vote / self.vote[rows].amax(1)
-        kept = relative >= relative.max().clamp_max(LEAST_VOTE)
-        return rows[kept], self.rotation[rows, best][kept]
+                found[k] = score.log_softmax(-1).clamp_min(LEAST_NATS).mean(0)
+        return found

@@ -3,8 +3,8 @@
 
 The hypotheses of a trained model are ranked by its loss alone, and with the charge of a scorer that
 learned from training clouds as the model placed them, from their true poses, and from objects that
-say themselves how they stand (of these the share of views is logged that come to stand as their
-objects do). Base rotations within 30 degrees of the truth count as right, after the constant turn
+say themselves how they stand, be their frames trusted or not (how widely their cameras spread is
+logged). Base rotations within 30 degrees of the truth count as right, after the constant turn
 between the two frames that fits most.
 
     python scripts/experiments/orientation.py RUN DATA/sensor drawer [CLOUDS]
@@ -73,8 +73,8 @@ def tell(name: str, found: torch.Tensor, truth: torch.Tensor, frame: torch.Tenso
 def by_objects(
     method: TemplateRegistration, data: Path, category: str, space: SearchSpace
 ) -> OrientationScorer:
-    """What objects of the training split teach, be it better than the loss or not."""
-    object_frames.LEAST_GAIN = -1.0
+    """What objects of the training split teach, however their cameras lie."""
+    object_frames.LEAST_SPREAD = 0.0
     dataset, config = store.dataset(data, category, "train"), method.config.discovery
     kinds, generator = method.template.kinds, torch.Generator().manual_seed(1)
     instance = torch.tensor([int(dataset[k]["instance"]) for k in range(len(dataset))])
@@ -92,7 +92,7 @@ def by_objects(
     hypotheses = search(method.template, owned.views, space)
     scorer = taught_by_objects(known, kinds, owned, hypotheses, generator)
     if scorer is None:
-        raise AssertionError("whatever they gain, they teach")
+        raise AssertionError("however their cameras lie, they teach")
     return scorer
 
 
