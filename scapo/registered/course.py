@@ -21,7 +21,7 @@ from scapo.categories import JointKind
 from scapo.method import Journal
 from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.initialisation import fitted_of_each
+from scapo.registered.initialisation import fitted_of_each, pairs_of_one
 from scapo.registered.joint_proposals import JointProposal, PosedViews
 from scapo.registered.objects import AGREEING, OneObject, rows_of_draws
 from scapo.registered.orientation import OrientationScorer
@@ -88,7 +88,7 @@ def plan_of(
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION
     if objects:
-        pairs = comb(config.further_views, 2) * PAIR * config.rotations / GRID
+        pairs = len(pairs_of_one(config.further_views)) * PAIR * config.rotations / GRID
         plan |= dict.fromkeys(numbered("further object", further), pairs)
         shown = objects * config.object_views + further * config.further_views
         plan["search of objects"] = VIEW * AGREEING * shown
@@ -113,7 +113,7 @@ def numbered(what: str, count: int) -> list[str]:
 
 def _of_objects(config: DiscoveryConfig, objects: int) -> tuple[dict[str, float], int]:
     """The first steps, and how many templates they give."""
-    each = OBJECT + comb(config.object_views, 2) * PAIR * config.rotations / GRID
+    each = OBJECT + len(pairs_of_one(config.object_views)) * PAIR * config.rotations / GRID
     plan = dict.fromkeys(numbered("object", objects), each)
     draws = numbered("draw", len(rows_of_draws(objects, config.draws)))
     return plan | {f"{draw}, template": OBJECTS for draw in draws}, len(draws)

@@ -47,7 +47,6 @@ from scapo.registered.objects import (
     surest_first,
 )
 from scapo.registered.orientation import OrientationScorer
-from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import (
     Searched,
     SearchResult,
@@ -192,7 +191,7 @@ def _how_objects_stand(
     """What tells of any view how it stands, learned from objects against the final template."""
     names = numbered("further object", len(further))
     jobs = {
-        name: partial(common_frame, views, config.rotations, AGREEING, OWN_HIDDEN_COST)
+        name: partial(common_frame, views, config.rotations, AGREEING, own=True)
         for name, views in zip(names, further, strict=True)
     }
     owned = all_views([*(one.posed for one in known), *course.steps(jobs)])

@@ -20,7 +20,7 @@ from scapo.registered.bundle_adjustment import Candidate, Inliers, first_fit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.gauge import principal_frame
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
-from scapo.registered.pairwise import HIDDEN_COST, register_pairs, rotation_grid
+from scapo.registered.pairwise import HIDDEN_COST, OWN_HIDDEN_COST, register_pairs, rotation_grid
 from scapo.registered.synchronisation import Synchronised, synchronise
 from scapo.registered.template import ArticulatedTemplate, Placement, spread_out, surface_features
 from scapo.registered.views import PartialViews
@@ -30,21 +30,24 @@ FRAME_EVERY = 4  # Of the normals, one in so many tells the main directions
 AXES_OF_SEVERAL = 2
 """Proposals of each joint that are fitted, at most, where a category has several joints."""
 TEMPLATE_EVERY = 2  # Of all moved and still points, one in so many may become one of the template's
+PARTNERS = 5
+"""Views of its object before a view in a ring, and as many after it, that it is registered with: of
+20 views half of all pairs, by which nearly as many poses are right."""
 SURENESS = 3.0  # Logit of the part that a point begins in
 
 
 def common_frame(
-    views: PartialViews, rotations: int, share: float, hidden_cost: float = HIDDEN_COST
+    views: PartialViews, rotations: int, share: float, *, own: bool = False
 ) -> PosedViews:
     """That share of the views, those that agree best, in one frame along main directions.
 
     Args:
-        views: Each is registered with every other.
+        views: They are registered with one another.
         rotations: How many are tried for each pair.
         share: Of the views.
-        hidden_cost: Of `register_pairs`.
+        own: All show one object.
     """
-    poses = registered_together(views, rotations, hidden_cost)
+    poses = registered_together(views, rotations, own=own)
     kept = surest_of(poses, share)
     views, poses = take(views, kept), take(poses, kept)
     rotation, translation = poses.rotation, poses.translation
@@ -59,13 +62,28 @@ def common_frame(
     )
 
 
-def registered_together(views: PartialViews, rotations: int, hidden_cost: float) -> Synchronised:
-    """The poses of views on which their registrations with one another agree."""
+def registered_together(views: PartialViews, rotations: int, *, own: bool = False) -> Synchronised:
+    """The poses of views on which their registrations with one another agree.
+
+    Views of one object, most of which match, are registered with some others (`PARTNERS`),
+    bare ones with all.
+    """
     count = len(views.points)
-    pairs = torch.combinations(torch.arange(count)).flip(-1)
-    grid = rotation_grid(rotations)
-    modes = register_pairs(views, pairs, rotations=grid, hidden_cost=hidden_cost)
+    pairs = pairs_of_one(count) if own else torch.combinations(torch.arange(count)).flip(-1)
+    cost = OWN_HIDDEN_COST if own else HIDDEN_COST
+    modes = register_pairs(views, pairs, rotations=rotation_grid(rotations), hidden_cost=cost)
     return synchronise(count, pairs, modes)
+
+
+def pairs_of_one(count: int) -> Int[Tensor, "Q 2"]:
+    """Views of one object that are registered with one another: later and earlier.
+
+    >>> len(pairs_of_one(20)), len(pairs_of_one(5))
+    (100, 10)
+    """
+    every = torch.combinations(torch.arange(count)).flip(-1)
+    apart = every[:, 0] - every[:, 1]
+    return every[torch.minimum(apart, count - apart) <= PARTNERS]
 
 
 def surest_of(poses: Synchronised, share: float) -> Int[Tensor, " K"]:

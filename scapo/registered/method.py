@@ -69,7 +69,7 @@ from scapo.types import Labels, Observation, Prediction, Supervision
 
 logger = logging.getLogger(__name__)
 
-FRAME = 3.5  # Seconds of one core for an object's views that are registered with one another
+FRAME = 2.2  # Seconds of one core for an object's views that are registered with one another
 TURNED = 50  # Clouds that are placed at a time as their objects stand
 
 
@@ -204,7 +204,7 @@ class TemplateRegistration(AbstractRegistered):
             return super()._trusted(found, cloud, labels, generator)
         if self._frames is None:
             self._frames = self._frames_of(cloud, known, generator)
-        ways = how_objects_stand(found, self._frames)
+        ways = how_objects_stand(found, self._frames, self.orientation)
         agrees = agreeing(found, self._frames, ways)[1]
         row, wanted = against(agrees, self._frames, ways)
         said = "%.0f %% of the clouds stand as their objects do; %d more are asked whether they may"
@@ -221,7 +221,7 @@ class TemplateRegistration(AbstractRegistered):
         """Of each object, from registrations of its views with one another."""
         rotations = self.config.discovery.rotations
         jobs = [partial(frame_of, row, self._of_one_size(cloud[row]), rotations) for row in known]
-        frames, makers = list[ObjectFrame](), {"ObjectFrame": ObjectFrame}
+        frames, makers = list[ObjectFrame](), {x.__name__: x for x in (ObjectFrame, PartialViews)}
         for k, make in enumerate(self.journal.ahead(jobs)):
             left = FRAME * (len(jobs) - k)
             self.journal.tell(f"object {k} of {len(jobs)}", k / len(jobs), left)

@@ -29,7 +29,6 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import common_frame, first_template
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
 from scapo.registered.orientation import quarter_turns
-from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
 from scapo.registered.view_states import Motion, apart, motion_of
@@ -219,7 +218,7 @@ def one_object(
     generator: torch.Generator,
 ) -> OneObject:
     """The frame and joints of one object from views of it alone."""
-    posed = common_frame(views, config.rotations, AGREEING, OWN_HIDDEN_COST)
+    posed = common_frame(views, config.rotations, AGREEING, own=True)
     moved, proposals = zip(*propose_joints(posed, kinds, generator), strict=True)
     points, _ = posed.world(moved[0].shape[1])
     still = points[~torch.stack(moved).any(0)]

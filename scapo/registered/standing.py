@@ -4,8 +4,9 @@
 A template that fits an object upside down nearly as well as upright is placed wrongly in many of
 its views, and a network that learns from these learns both. Views of one object need no template
 to be brought together: its shape is the same in all. Then one rotation is left open for all of its
-views, and two things tell it: on how many of the views' candidates a way agrees, and where the
-cameras would have stood, which is much the same for all objects of a category.
+views: that on which most of their candidates agree, or a quarter turn of it. Which, a scorer tells
+that has learned how views look that stand right (`orientation`): of one view it is often wrong, of
+all views of an object hardly ever.
 """
 
 from __future__ import annotations
@@ -19,17 +20,15 @@ from torch import Tensor
 
 from scapo.records import cat, take
 from scapo.registered.initialisation import registered_together, surest_of
-from scapo.registered.object_frames import Ways, ways_of
+from scapo.registered.object_frames import LEAST_NATS
 from scapo.registered.objects import AGREEING
-from scapo.registered.pairwise import OWN_HIDDEN_COST, within
+from scapo.registered.orientation import OrientationScorer, quarter_turns
+from scapo.registered.pairwise import within
 from scapo.registered.pose_search import VOTE
 from scapo.registered.pseudo_labels import Candidates
+from scapo.registered.synchronisation import densest
 from scapo.registered.views import PartialViews
 
-CAMERAS = 0.2  # Share of votes that a way is worth by which cameras are e times likelier
-SHARP, LEAST_LIKELY = 8.0, 0.02
-"""Concentration of directions about each camera of the other objects, and the density at least."""
-SWEEPS = 10  # Over all objects, in which each takes the way that goes best with the others
 NEAR = 30.0  # Degrees from its object's way within which a candidate says the same
 AGAINST = 1.0  # Loss that another candidate costs
 
@@ -42,8 +41,8 @@ class ObjectFrame:
     """Which of the clouds they are."""
     turn: Float[Tensor, "V 3 3"]
     """view_R_object"""
-    camera: Float[Tensor, "V 3"]
-    """Directions to the cameras in that frame."""
+    views: PartialViews
+    """What they show."""
 
     def rotation(self, way: Float[Tensor, "3 3"]) -> Float[Tensor, "V 3 3"]:
         """view_R_template, where the template stands in the object's frame so."""
@@ -58,50 +57,32 @@ def frame_of(row: Int[Tensor, " N"], views: PartialViews, rotations: int) -> Obj
         views: All of one size.
         rotations: How many are tried for each pair.
     """
-    poses = registered_together(views, rotations, OWN_HIDDEN_COST)
+    poses = registered_together(views, rotations, own=True)
     kept = surest_of(poses, AGREEING)
-    turn = poses.rotation[kept]
-    camera = (turn @ views.direction()[kept][..., None])[..., 0]
-    return ObjectFrame(row=row[kept], turn=turn.mT.contiguous(), camera=camera)
+    turn = poses.rotation[kept].mT.contiguous()
+    return ObjectFrame(row=row[kept], turn=turn, views=take(views, kept))
 
 
 @torch.no_grad()
 def how_objects_stand(
-    found: Candidates, frames: Sequence[ObjectFrame]
+    found: Candidates, frames: Sequence[ObjectFrame], scorer: OrientationScorer
 ) -> list[Float[Tensor, "3 3"]]:
     """object_R_template of each object.
 
     Args:
         found: Of all clouds.
         frames: Of objects.
+        scorer: Of frames of single views.
     """
     vote = torch.softmax(-VOTE * found.gap, 1)
     turn = found.placement.rotation.unflatten(0, found.gap.shape)
-    ways = [ways_of(one.turn.mT[:, None] @ turn[one.row], vote[one.row]) for one in frames]
-    chosen = [0] * len(frames)
-    for _ in range(SWEEPS):
-        likely = _likely(frames, ways, chosen)
-        before = chosen
-        chosen = [
-            int((way.share + CAMERAS * its).argmax()) for way, its in zip(ways, likely, strict=True)
-        ]
-        if chosen == before:
-            break
-    return [way.frame[k] for way, k in zip(ways, chosen, strict=True)]
-
-
-def _likely(
-    frames: Sequence[ObjectFrame], ways: Sequence[Ways], chosen: Sequence[int]
-) -> list[Float[Tensor, " M"]]:
-    """Mean log density of an object's cameras, for each of its ways, where others' cameras are."""
-    cameras = [one.camera @ way.frame[k] for one, way, k in zip(frames, ways, chosen, strict=True)]
-    found: list[Tensor] = []
-    for k, (one, way) in enumerate(zip(frames, ways, strict=True)):
-        others = cameras[:k] + cameras[k + 1 :]
-        cosine = (one.camera @ way.frame) @ torch.cat(others or cameras).mT  # (M, V, others)
-        density = torch.exp(SHARP * (cosine - 1)).mean(-1)
-        found.append((density + LEAST_LIKELY).log().mean(-1))
-    return found
+    ways: list[Tensor] = []
+    for one in frames:
+        said = (one.turn.mT[:, None] @ turn[one.row]).flatten(0, 1)
+        every = densest(said, vote[one.row].flatten())[0] @ quarter_turns()
+        nats = scorer(one.views, one.turn[:, None] @ every).log_softmax(-1)
+        ways.append(every[nats.clamp_min(LEAST_NATS).mean(0).argmax()])
+    return ways
 
 
 def agreeing(

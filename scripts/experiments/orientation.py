@@ -32,7 +32,6 @@ from scapo.registered.object_frames import all_views, taught_by_objects
 from scapo.registered.objects import AGREEING, grouped, one_object, surest_first
 from scapo.registered.orientation import CHARGE, MOST, OrientationScorer, quarter_turns
 from scapo.registered.outliers import inlier_mask, replaced
-from scapo.registered.pairwise import OWN_HIDDEN_COST
 from scapo.registered.pose_search import (
     CHARGED,
     Hypotheses,
@@ -87,7 +86,7 @@ def by_objects(
     )
     known = surest_first([one_object(views, kinds, config, generator) for views in first])
     posed = [one.posed for one in known]
-    posed += [common_frame(one, config.rotations, AGREEING, OWN_HIDDEN_COST) for one in further]
+    posed += [common_frame(one, config.rotations, AGREEING, own=True) for one in further]
     owned = all_views(posed)
     hypotheses = search(method.template, owned.views, space)
     scorer = taught_by_objects(known, kinds, owned, hypotheses, generator)

@@ -93,7 +93,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return [advancing(copied(one), g) for _ in range(2)]
 
     for name, step in {
-        "common_frame": lambda *_: posed,
+        "common_frame": lambda *_, **__: posed,
         "fitted_proposals": lambda *x: [candidate("first", x[-1]) for _ in range(3)],
         "one_object": lambda *x: known(torch.eye(3), len(made), (0.2, 0.1, 0.1)),
         "object_candidate": lambda *x: candidate("objects", x[-1]),

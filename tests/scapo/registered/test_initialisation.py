@@ -10,7 +10,12 @@ import torch
 
 from scapo.geometry.rigid import axis_angle
 from scapo.registered.config import DiscoveryConfig
-from scapo.registered.initialisation import first_template, fitted_proposals
+from scapo.registered.initialisation import (
+    PARTNERS,
+    first_template,
+    fitted_proposals,
+    pairs_of_one,
+)
 from scapo.registered.joint_proposals import JointProposal, PosedViews
 from tests.helpers.sighted import AXIS, PIVOT, sighted
 from tests.helpers.sliding import OUT, UP, cabinet, placements, seen
@@ -50,3 +55,13 @@ def test_still_points_begin_as_base_and_moved_ones_as_parts_of_the_proposed_join
         assert torch.cdist(mine, points[own]).amin(1).max() < 1e-3
     assert torch.equal(made.axis[0], AXIS)
     assert torch.equal(made.pivot[0], PIVOT)
+
+
+def test_views_of_one_object_are_registered_with_as_many_others_each():
+    pairs = pairs_of_one(24)
+    assert (pairs[:, 0] > pairs[:, 1]).all()
+    assert len(pairs.unique(dim=0)) == len(pairs) == 24 * PARTNERS
+    assert pairs.flatten().bincount().tolist() == [2 * PARTNERS] * 24
+    assert [23, 4] in pairs.tolist()
+    assert len(pairs_of_one(11)) == 55  # all
+    assert len(pairs_of_one(2)) == 1
