@@ -46,9 +46,9 @@ class JointLimits:
         outside = (self.low - state).clamp_min(0) + (state - self.high).clamp_min(0)
         return (SLOPE * outside * self.unit).clamp_max(OUTSIDE_COST).sum(-1)
 
-    def extent(self) -> float:
-        """Radians, or mean radii of a sliding joint, of all joints together."""
-        return float(((self.high - self.low) * self.unit).sum())
+    def extent(self, weight: Float[Tensor, " J"]) -> float:
+        """Radians, or mean radii of a sliding joint, of all joints together, by these weights."""
+        return float(((self.high - self.low) * self.unit * weight).sum())
 
     def wider(self, share: float) -> JointLimits:
         """With room of a share of the range on both sides."""

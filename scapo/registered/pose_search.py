@@ -305,12 +305,26 @@ def search_views(
 def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConfig) -> float:
     """Mean loss of views within their narrowest joint limits, plus what that range costs.
 
-    The range counts because a joint along a wrong axis explains almost as much with more of it, and
-    so does, for joints of one kind, how far from parallel they are.
+    The range counts because a joint along a wrong axis explains almost as much with more of it, of
+    several joints by how much each moves; and so does, for joints of one kind, how far from
+    parallel they are.
     """
     found, limits = _within_limits(candidate, search_near(candidate, views), config)
-    cost = config.range_cost * limits.extent() + config.askew_cost * askew(candidate.template)
+    extent = limits.extent(surface_moved(candidate.template))
+    cost = config.range_cost * extent + config.askew_cost * askew(candidate.template)
     return float(found.loss.mean()) + cost
+
+
+@torch.no_grad()
+def surface_moved(template: ArticulatedTemplate) -> Float[Tensor, " J"]:
+    """What a joint's range counts: 1 for half of the surface, as a laptop's lid is; 1 of one joint.
+
+    Of several, that of a handle can explain little, and may cost little: else a template without
+    it is cheaper.
+    """
+    if len(template.kinds) == 1:
+        return torch.ones(1)
+    return 2 * template.logit.softmax(-1).mean(0)[1:]
 
 
 @torch.no_grad()
