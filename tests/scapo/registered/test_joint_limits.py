@@ -45,6 +45,7 @@ def test_penalty_grid_and_room():
     assert charged.tolist() == pytest.approx([0.0, 0.1, 0.08, OUTSIDE_COST], abs=1e-6)
     assert states.wider(0.5).high.tolist() == pytest.approx([1.5, 0.3])
     assert states.grid(3)[1].tolist() == pytest.approx([0.0, 0.1, 0.2])
+    assert states.extent(torch.tensor([0.5, 0.25])) == pytest.approx(0.5 + 0.25 * 4 * 0.2)
     assert limits_of(
         torch.linspace(0, 1, 101)[:, None], ("prismatic",)
     ).low.item() == pytest.approx(0.02)

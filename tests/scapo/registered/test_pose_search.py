@@ -20,6 +20,7 @@ from scapo.registered.pose_search import (
     rank_by_confidence,
     refine_states,
     search,
+    surface_moved,
 )
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_bank import ViewBank
@@ -50,6 +51,14 @@ def test_joints_of_one_kind_are_askew_that_are_not_parallel():
     made.axis.data.copy_(axes)  # no length, and no sense, is asked for
     assert abs(askew(made) - 2 * 0.4) < 1e-6
     assert askew(ArticulatedTemplate(("revolute",), 10)) == 0
+
+
+def test_the_range_of_a_small_part_costs_little() -> None:
+    made = ArticulatedTemplate(("revolute", "revolute"), 10)
+    part = torch.tensor([0] * 4 + [1] * 5 + [2])
+    made.logit.data.copy_(40 * torch.nn.functional.one_hot(part))
+    assert torch.allclose(surface_moved(made), torch.tensor([1.0, 0.2]))
+    assert surface_moved(ArticulatedTemplate(("revolute",), 10)).tolist() == [1.0]
 
 
 def test_a_wrong_state_is_corrected_and_the_rest_kept():
