@@ -72,7 +72,7 @@ def how_objects_stand(
     Args:
         found: Of all clouds.
         frames: Of objects.
-        scorer: Of frames of single views.
+        scorer: Of frames of single views; one that was not taught says nothing.
     """
     vote = torch.softmax(-VOTE * found.gap, 1)
     turn = found.placement.rotation.unflatten(0, found.gap.shape)
@@ -81,7 +81,8 @@ def how_objects_stand(
         said = (one.turn.mT[:, None] @ turn[one.row]).flatten(0, 1)
         every = densest(said, vote[one.row].flatten())[0] @ quarter_turns()
         nats = scorer(one.views, one.turn[:, None] @ every).log_softmax(-1)
-        ways.append(every[nats.clamp_min(LEAST_NATS).mean(0).argmax()])
+        likely = scorer.learned * nats.clamp_min(LEAST_NATS).mean(0)
+        ways.append(every[likely.argmax()])
     return ways
 
 
