@@ -5,8 +5,8 @@ A template that fits an object upside down nearly as well as upright is placed w
 its views, and a network that learns from these learns both. Views of one object need no template
 to be brought together: its shape is the same in all. Then one rotation is left open for all of its
 views: that on which most of their candidates agree, or a quarter turn of it. Which, a scorer tells
-that has learned how views look that stand right (`orientation`): of one view it is often wrong, of
-all views of an object hardly ever.
+that has learned how views look that stand right (`orientation`), by all views of the object: it is
+wrong of these less often than of one.
 """
 
 from __future__ import annotations
