@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 from scapo.registered.joint_limits import RANGE_COST
 
@@ -33,6 +33,9 @@ class TemplateConfig:
 class DiscoveryConfig(TemplateConfig):
     """How the template is found, and how much is tried; times are of one CPU core."""
 
+    RETIRED: ClassVar[tuple[str, ...]] = ("further_objects", "further_views")
+    """Fields that checkpoints of earlier versions have."""
+
     seeds: int = 72
     """Views registered with one another in each draw, 10 ms a pair."""
     agreeing: float = 0.4
@@ -51,10 +54,6 @@ class DiscoveryConfig(TemplateConfig):
     """Objects of which views are registered with one another."""
     object_views: int = 20
     """Views of each of them."""
-    further_objects: int = 36
-    """Objects beside them that show how objects of the category stand."""
-    further_views: int = 10
-    """Views of each of these."""
     contenders: int = 2
     """First templates of each draw, those of least loss, that held-out views judge."""
     finalists: int = 3
@@ -189,8 +188,8 @@ def quick_config() -> RegisteredConfig:
     """For trying things: trains one category in less than two minutes on two cores."""
     discovery = DiscoveryConfig(
         seeds=32, searched=48, trusted=(0.6, 0.85), starts=2, draws=2, objects=8, object_views=12,
-        further_objects=8, further_views=8, contenders=1, heats=(), judged=16, mirror=False,
-        halves=False, leans=False, final_points=800, dense_rounds=1,
+        contenders=1, heats=(), judged=16, mirror=False, halves=False, leans=False,
+        final_points=800, dense_rounds=1,
     )  # fmt: skip
     return RegisteredConfig(
         preset="quick", discovery=discovery, learned=120, placed=240, rounds=1, epochs=10

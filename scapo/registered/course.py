@@ -23,7 +23,8 @@ from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import fitted_of_each, pairs_of_one
 from scapo.registered.joint_proposals import JointProposal, PosedViews
-from scapo.registered.objects import AGREEING, OneObject, rows_of_draws
+from scapo.registered.object_frames import ASKED
+from scapo.registered.objects import OneObject, rows_of_draws
 from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pose_search import Hypotheses, SearchResult
 from scapo.registered.template import ArticulatedTemplate, Placement
@@ -35,12 +36,12 @@ T = TypeVar("T")
 JUDGES = 4  # At most one view in so many is held out
 PAIR, GRID = 0.010, 1000
 """Seconds of one core, as all below: a pair of views that is registered over so many rotations."""
-FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE, HALVES, DEVIATION = 0.2, 3.6, 8.0, 3.6, 3.0, 80.0, 40.0
+FIRST_FIT, OBJECT, OBJECTS, FIT, DENSE = 0.2, 3.6, 8.0, 3.6, 3.0
 """A view that a first template is fitted to; an object beside its pairs; the first template of
-several objects; bundle adjustment after a search; a dense template; two like halves; axes that
-deviate."""
+several objects; bundle adjustment after a search; a dense template."""
+HALVES, DEVIATION, STANDING = 80.0, 40.0, 3.0
+"""Two like halves; axes that deviate; a scorer of how objects stand."""
 VIEW = 0.072  # A view that is searched
-OBJECT_VIEW = 0.08  # A view of an object that tells how objects stand
 BELIEF = 20.0  # Seconds of steps for which usual times count, beside those that were measured
 RECORDS: tuple[type[Any], ...] = (
     Candidate, Hypotheses, Inliers, JointProposal, Motion, OneObject, PartialViews, Placement,
@@ -54,7 +55,6 @@ def plan_of(
     kinds: tuple[JointKind, ...],
     views: int,
     objects: int = 0,
-    further: int = 0,
 ) -> dict[str, float]:
     """The steps of a discovery in order, and the seconds that each usually takes on one core.
 
@@ -63,7 +63,6 @@ def plan_of(
         kinds: Of the joints.
         views: All that are learned from.
         objects: Objects of each of which views are known.
-        further: Those beside them.
     """
     judged = VIEW * min(config.judged, views // JUDGES)
     half = VIEW * min(config.searched // 2, views) + FIT
@@ -88,11 +87,8 @@ def plan_of(
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION
     if objects:
-        pairs = len(pairs_of_one(config.further_views)) * PAIR * config.rotations / GRID
-        plan |= dict.fromkeys(numbered("further object", further), pairs)
-        shown = objects * config.object_views + further * config.further_views
-        plan["search of objects"] = VIEW * AGREEING * shown
-        plan["how objects stand"] = OBJECT_VIEW * AGREEING * shown
+        plan["search of objects"] = VIEW * ASKED
+        plan["how objects stand"] = STANDING
     plan["search of all views"] = VIEW * views
     return plan
 

@@ -35,10 +35,8 @@ from scapo.registered.halves import are_halves, in_halves, may_have_halves
 from scapo.registered.initialisation import common_frame, fitted_proposals
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.mirror_images import mirrored, paired
-from scapo.registered.object_frames import all_views, taught_by_objects
+from scapo.registered.object_frames import ASKED, taught_by_objects
 from scapo.registered.objects import (
-    AGREEING,
-    ObjectViews,
     OneObject,
     draws_of,
     object_candidate,
@@ -61,7 +59,6 @@ from scapo.registered.views import PartialViews
 logger = logging.getLogger(__name__)
 
 STRIDE = 3  # Views by which the draws are apart
-NO_OBJECTS = ObjectViews()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +76,7 @@ def discover(
     kinds: tuple[JointKind, ...],
     config: DiscoveryConfig,
     generator: torch.Generator,
-    objects: ObjectViews = NO_OBJECTS,
+    objects: Sequence[PartialViews] = (),
     journal: Journal = NO_JOURNAL,
 ) -> Discovery:
     """The articulated template of views of one category, and its placement in all of them.
@@ -92,16 +89,16 @@ def discover(
         objects: Views of one object each, where it is known which show the same.
         journal: Told of every step; keeps them.
     """
-    plan = plan_of(config, kinds, len(views.points), len(objects.known), len(objects.further))
+    plan = plan_of(config, kinds, len(views.points), len(objects))
     course = Course(kinds, generator, plan, journal)
     judges, others = held_out(views, config.judged)
     total = len(others.points)
     known = list[OneObject]()
     half: Searched = take(others, evenly(total, config.searched // 2))
     searched: Searched = take(others, evenly(total, config.searched))
-    if objects.known:
+    if objects:
         config = replace(config, way_out=False)  # the objects' own motions tell the axes
-        known = _known_objects(objects.known, kinds, config, course)
+        known = _known_objects(objects, kinds, config, course)
         tried = _of_objects(known, kinds, config, course)
         half = owned_views(known[: len(known) // 2], config.searched // 2)
         searched = owned_views(known, config.searched)
@@ -114,7 +111,7 @@ def discover(
     if config.leans and "revolute" in kinds:
         deviating = partial(with_axis_deviation, best, judges, config, generator, journal)
         best = course.step("deviating axes", deviating)
-    scorer = _how_objects_stand(best, known, objects.further, config, course) if known else None
+    scorer = _how_objects_stand(best, known, course) if known else None
     searching = partial(search_views, best, views, scorer, journal)
     found = course.step("search of all views", searching)
     return Discovery(template=best.template, found=found, scorer=scorer)
@@ -182,22 +179,13 @@ def _of_objects(
 
 
 def _how_objects_stand(
-    best: Candidate,
-    known: list[OneObject],
-    further: Sequence[PartialViews],
-    config: DiscoveryConfig,
-    course: Course,
+    best: Candidate, known: list[OneObject], course: Course
 ) -> OrientationScorer | None:
-    """What tells of any view how it stands, learned from objects against the final template."""
-    names = numbered("further object", len(further))
-    jobs = {
-        name: partial(common_frame, views, config.rotations, AGREEING, own=True)
-        for name, views in zip(names, further, strict=True)
-    }
-    owned = all_views([*(one.posed for one in known), *course.steps(jobs)])
-    searching = partial(search_near, best, owned.views, journal=course.journal)
+    """What tells of any view how it stands, learned from objects, in the final template's frame."""
+    views = owned_views(known, ASKED).views
+    searching = partial(search_near, best, views, journal=course.journal)
     hypotheses, kinds = course.step("search of objects", searching), best.template.kinds
-    taught = partial(taught_by_objects, known, kinds, owned, hypotheses, course.generator)
+    taught = partial(taught_by_objects, known, kinds, hypotheses, course.generator)
     return course.step("how objects stand", taught)
 
 

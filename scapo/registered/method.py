@@ -41,7 +41,7 @@ from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.learning import candidates
-from scapo.registered.objects import LEAST_OBJECTS, ObjectViews, grouped, rows_by_object
+from scapo.registered.objects import LEAST_OBJECTS, grouped, rows_by_object
 from scapo.registered.outliers import replaced
 from scapo.registered.pose_search import BRIEF, CHARGED, successive_halving
 from scapo.registered.pseudo_labels import Candidates, LearnedClouds
@@ -168,8 +168,7 @@ class TemplateRegistration(AbstractRegistered):
         """Of all steps of a discovery."""
         config = self.config.discovery
         objects = config.objects if self.supervision else 0
-        further = config.further_objects if self.supervision else 0
-        return sum(plan_of(config, self.template.kinds, clouds, objects, further).values())
+        return sum(plan_of(config, self.template.kinds, clouds, objects).values())
 
     def _found(
         self,
@@ -180,14 +179,11 @@ class TemplateRegistration(AbstractRegistered):
     ) -> Discovery:
         """By registration and bundle adjustment of the views."""
         kinds, config = self.template.kinds, self.config.discovery
-        objects = ObjectViews()
+        objects = list[PartialViews]()
         if labels.instance is not None:
-            known, further = (
-                [self._of_one_size(observation.points[rows].cpu()) for rows in some]
-                for some in grouped(labels.instance.cpu(), config)
-            )
-            objects = ObjectViews(known=known, further=further)
-            if not known:
+            rows = grouped(labels.instance.cpu(), config)
+            objects = [self._of_one_size(observation.points[own].cpu()) for own in rows]
+            if not objects:
                 logger.warning("too few clouds of any one object: which show the same is not used")
         return discover(learned.views, kinds, config, generator, objects, self.journal)
 
@@ -195,25 +191,32 @@ class TemplateRegistration(AbstractRegistered):
         self, found: Candidates, cloud: Tensor, labels: Labels, generator: torch.Generator
     ) -> tuple[Candidates, Float[Tensor, " B"]]:
         """The clouds that stand as their objects do, if these are asked (`standing`)."""
+        if self.config.stand != "objects":
+            return super()._trusted(found, cloud, labels, generator)
         known = [] if labels.instance is None else rows_by_object(labels.instance)
-        asked, alike = self.config.stand == "objects", self.category.symmetry is not None
-        if not asked or alike or len(known) < LEAST_OBJECTS:
-            if asked:
-                why = "its parts look alike" if alike else "which clouds show the same is not known"
-                logger.warning("how objects stand is not asked: %s", why)
+        if why := self._not_asked(known):
+            logger.warning("how objects stand is not asked: %s", why)
             return super()._trusted(found, cloud, labels, generator)
         if self._frames is None:
             self._frames = self._frames_of(cloud, known, generator)
-        ways = how_objects_stand(found, self._frames, self.orientation)
-        agrees = agreeing(found, self._frames, ways)[1]
-        row, wanted = against(agrees, self._frames, ways)
+        frames, ways = how_objects_stand(self._frames, self.orientation)
+        agrees = agreeing(found, frames, ways)[1]
+        row, wanted = against(agrees, frames, ways)
         said = "%.0f %% of the clouds stand as their objects do; %d more are asked whether they may"
         logger.info(said, 100 * agrees.float().mean(), len(row))
         if len(row):
             other = self._turned(cloud[row], wanted, generator)
             found = exchanged(found, row, other)
-        found, agrees = agreeing(found, self._frames, ways)
+        found, agrees = agreeing(found, frames, ways)
         return found, agrees.to(found.gap)
+
+    def _not_asked(self, known: list[Int[Tensor, " V"]]) -> str:
+        """Why the objects of these clouds are not asked how they stand; empty: they are."""
+        if self.category.symmetry is not None:
+            return "its parts look alike"
+        if not bool(self.orientation.learned):
+            return "nothing tells how views stand"
+        return "" if len(known) >= LEAST_OBJECTS else "which clouds show the same is not known"
 
     def _frames_of(
         self, cloud: Tensor, known: list[Int[Tensor, " V"]], generator: torch.Generator

@@ -52,16 +52,6 @@ SWEEPS = 10  # Over all objects, in which each takes the frame that agrees best 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ObjectViews:
-    """Views of one object each."""
-
-    known: Sequence[PartialViews] = ()
-    """Of objects that a template may start from."""
-    further: Sequence[PartialViews] = ()
-    """Fewer, of others, which show how objects stand."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class OneObject:
     """Views of one object in a frame along its main directions, and what moved in them."""
 
@@ -192,23 +182,16 @@ def rows_by_object(instance: Int[Tensor, " N"]) -> list[Int[Tensor, " _"]]:
     return [rows for rows in every if len(rows) >= LEAST_SHOWN]
 
 
-def grouped(
-    instance: Int[Tensor, " N"], config: DiscoveryConfig
-) -> tuple[list[Int[Tensor, " _"]], list[Int[Tensor, " _"]]]:
-    """Which clouds are looked at of which objects, and of which further ones, spread over all.
+def grouped(instance: Int[Tensor, " N"], config: DiscoveryConfig) -> list[Int[Tensor, " _"]]:
+    """Which clouds are looked at of which objects, spread over all.
 
     Objects of too few clouds (`LEAST_SHOWN`) are passed over, and all where few objects are left.
     """
     every = rows_by_object(instance)
     if len(every) < LEAST_OBJECTS:
-        return [], []
-    some = evenly(len(every), config.objects).tolist()
-    others = [k for k in range(len(every)) if k not in some]
-    others = [others[k] for k in evenly(len(others), config.further_objects).tolist()]
-    return (
-        [every[k][evenly(len(every[k]), config.object_views)] for k in some],
-        [every[k][evenly(len(every[k]), config.further_views)] for k in others],
-    )
+        return []
+    some = [every[k] for k in evenly(len(every), config.objects)]
+    return [rows[evenly(len(rows), config.object_views)] for rows in some]
 
 
 def one_object(

@@ -4,9 +4,10 @@
 A template that fits an object upside down nearly as well as upright is placed wrongly in many of
 its views, and a network that learns from these learns both. Views of one object need no template
 to be brought together: its shape is the same in all. Then one rotation is left open for all of its
-views: that on which most of their candidates agree, or a quarter turn of it. Which, a scorer tells
-that has learned how views look that stand right (`orientation`), by all views of the object: it is
-wrong of these less often than of one.
+views, a quarter turn of the main directions of its surface. Which, a scorer tells that has learned
+how views look that stand right (`orientation`), by all views of the object: it is wrong of these
+less often than of one. Views of which it says another turn are mostly those that were registered
+wrongly.
 """
 
 from __future__ import annotations
@@ -19,18 +20,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.records import cat, take
-from scapo.registered.initialisation import registered_together, surest_of
-from scapo.registered.object_frames import LEAST_NATS
+from scapo.registered.gauge import principal_frame
+from scapo.registered.initialisation import FRAME_EVERY, registered_together, surest_of
 from scapo.registered.objects import AGREEING
 from scapo.registered.orientation import OrientationScorer, quarter_turns
 from scapo.registered.pairwise import within
-from scapo.registered.pose_search import VOTE
 from scapo.registered.pseudo_labels import Candidates
-from scapo.registered.synchronisation import densest
 from scapo.registered.views import PartialViews
 
 NEAR = 30.0  # Degrees from its object's way within which a candidate says the same
 AGAINST = 1.0  # Loss that another candidate costs
+LEAST_NATS = -4.0  # What a view can hold against a way at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,25 +65,23 @@ def frame_of(row: Int[Tensor, " N"], views: PartialViews, rotations: int) -> Obj
 
 @torch.no_grad()
 def how_objects_stand(
-    found: Candidates, frames: Sequence[ObjectFrame], scorer: OrientationScorer
-) -> list[Float[Tensor, "3 3"]]:
-    """object_R_template of each object.
+    frames: Sequence[ObjectFrame], scorer: OrientationScorer
+) -> tuple[list[ObjectFrame], list[Float[Tensor, "3 3"]]]:
+    """The objects, with those of their views that say the same as all, and object_R_template.
 
     Args:
-        found: Of all clouds.
         frames: Of objects.
-        scorer: Of frames of single views; one that was not taught says nothing.
+        scorer: Of frames of single views.
     """
-    vote = torch.softmax(-VOTE * found.gap, 1)
-    turn = found.placement.rotation.unflatten(0, found.gap.shape)
-    ways: list[Tensor] = []
+    kept, ways = list[ObjectFrame](), list[Tensor]()
     for one in frames:
-        said = (one.turn.mT[:, None] @ turn[one.row]).flatten(0, 1)
-        every = densest(said, vote[one.row].flatten())[0] @ quarter_turns()
+        normals = one.views.normals[:, ::FRAME_EVERY] @ one.turn
+        every = principal_frame(normals.flatten(0, 1)).mT @ quarter_turns()
         nats = scorer(one.views, one.turn[:, None] @ every).log_softmax(-1)
-        likely = scorer.learned * nats.clamp_min(LEAST_NATS).mean(0)
-        ways.append(every[likely.argmax()])
-    return ways
+        likely = int(nats.clamp_min(LEAST_NATS).mean(0).argmax())
+        kept.append(take(one, nats.argmax(1) == likely))
+        ways.append(every[likely])
+    return kept, ways
 
 
 def agreeing(

@@ -84,7 +84,8 @@ def from_json(
         data: As `json.loads` gives it.
         where: File, and the place in it, for the message.
         error: What is raised.
-        others: Whether fields that the dataclass lacks are refused.
+        others: Whether fields that the dataclass lacks are refused; those that it once had, which
+            its `RETIRED` names, are not.
         link: Between the names of a record and of its field, in messages.
 
     Raises:
@@ -110,7 +111,7 @@ class _Reader:
         if not isinstance(data, dict):
             raise self.error(f"{where}: expected an object, found {type(data).__name__}")
         found, known = cast("dict[str, object]", data), _fields(kind)
-        unknown = sorted(set(found) - set(known))
+        unknown = sorted(set(found) - set(known) - set(getattr(kind, "RETIRED", ())))
         if unknown and self.others == "refuse":
             raise self.error(f"{where}: expected fields of {kind.__name__}, found {unknown[0]!r}")
         for name, (item, _) in known.items():

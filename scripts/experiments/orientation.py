@@ -26,10 +26,9 @@ from scapo.geometry.rigid import rotation_angle
 from scapo.method import evenly
 from scapo.records import cat, take
 from scapo.registered import object_frames
-from scapo.registered.initialisation import common_frame
 from scapo.registered.method import TemplateRegistration
-from scapo.registered.object_frames import all_views, taught_by_objects
-from scapo.registered.objects import AGREEING, grouped, one_object, surest_first
+from scapo.registered.object_frames import ASKED, taught_by_objects
+from scapo.registered.objects import grouped, one_object, owned_views, surest_first
 from scapo.registered.orientation import CHARGE, MOST, OrientationScorer, quarter_turns
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
@@ -77,19 +76,13 @@ def by_objects(
     dataset, config = store.dataset(data, category, "train"), method.config.discovery
     kinds, generator = method.template.kinds, torch.Generator().manual_seed(1)
     instance = torch.tensor([int(dataset[k]["instance"]) for k in range(len(dataset))])
-    first, further = (
-        [
-            method._of_one_size(torch.stack([dataset[int(k)]["points"] for k in rows]))
-            for rows in some
-        ]
-        for some in grouped(instance, config)
-    )
+    first = [
+        method._of_one_size(torch.stack([dataset[int(k)]["points"] for k in rows]))
+        for rows in grouped(instance, config)
+    ]
     known = surest_first([one_object(views, kinds, config, generator) for views in first])
-    posed = [one.posed for one in known]
-    posed += [common_frame(one, config.rotations, AGREEING, own=True) for one in further]
-    owned = all_views(posed)
-    hypotheses = search(method.template, owned.views, space)
-    scorer = taught_by_objects(known, kinds, owned, hypotheses, generator)
+    hypotheses = search(method.template, owned_views(known, ASKED).views, space)
+    scorer = taught_by_objects(known, kinds, hypotheses, generator)
     if scorer is None:
         raise AssertionError("however their cameras lie, they teach")
     return scorer

@@ -37,11 +37,7 @@ def test_the_quick_preset_does_less_of_the_same() -> None:
     assert quick.learned * quick.epochs < 0.1 * usual.learned * usual.epochs
     for objects in (False, True):
         seconds = [
-            sum(
-                plan_of(
-                    d, ("revolute",), one.learned, objects * d.objects, objects * d.further_objects
-                ).values()
-            )
+            sum(plan_of(d, ("revolute",), one.learned, objects * d.objects).values())
             for one in (quick, usual)
             for d in (one.discovery,)
         ]

@@ -22,7 +22,6 @@ from scapo.registered.config import DiscoveryConfig, RegisteredConfig
 from scapo.registered.course import Course, numbered, plan_of
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.method import TemplateRegistration
-from scapo.registered.objects import ObjectViews
 from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pose_search import Hypotheses, SearchResult
 from scapo.registered.template import Placement
@@ -116,8 +115,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def discovered(journal: Journal, objects: int, config: DiscoveryConfig = FEW) -> torch.Tensor:
     views, _ = shown()
-    several = ObjectViews(known=[views] * objects, further=[views] * (objects // 2))
-    found = discovery.discover(views, KINDS, config, generator(3), several, journal)
+    found = discovery.discover(views, KINDS, config, generator(3), [views] * objects, journal)
     assert (found.scorer is None) == (objects == 0)
     return found.template.pivot.detach()
 
@@ -129,7 +127,7 @@ def test_the_plan_names_the_steps_that_are_taken(
 ) -> None:
     journal, config = Told(), replace(FEW, mirror=mirror)
     discovered(journal, objects, config)
-    plan = plan_of(config, KINDS, 16, objects, objects // 2)
+    plan = plan_of(config, KINDS, 16, objects)
     assert [words for words, _, _ in journal.lines] == list(plan)
     seconds = list(plan.values())
     alone = ["judging first templates", "judging templates"] if objects else []
@@ -203,7 +201,7 @@ def test_an_interrupted_discovery_goes_on_bit_for_bit(
             return made
 
     caplog.set_level(logging.WARNING)
-    for _ in plan_of(FEW, KINDS, 16, objects, objects // 2):
+    for _ in plan_of(FEW, KINDS, 16, objects):
         with pytest.raises(InterruptedStepError):
             discovered(Cut(), objects)
     assert torch.equal(discovered(Cut(), objects), whole)

@@ -77,18 +77,13 @@ def test_groups_hold_clouds_of_one_object_and_pass_over_those_with_few() -> None
     order = torch.randperm(54, generator=generator(0))
     instance = torch.tensor([3] * 20 + [5] * 4 + [8] * 9 + [1] * 12 + [9] * 9)[order]
     config = DiscoveryConfig(objects=10, object_views=10)
-    groups, further = grouped(instance, config)
+    groups = grouped(instance, config)
     assert [instance[rows].unique().tolist() for rows in groups] == [[1], [3], [8], [9]]
     assert [len(rows) for rows in groups] == [10, 10, 9, 9]
-    assert further == []
-    few = DiscoveryConfig(objects=2, further_objects=9, further_views=5)
-    groups, further = grouped(instance, few)
+    groups = grouped(instance, DiscoveryConfig(objects=2))
     assert [instance[rows].unique().tolist() for rows in groups] == [[1], [9]]
-    assert [instance[rows].unique().tolist() for rows in further] == [[3], [8]]
-    assert [len(rows) for rows in further] == [5, 5]
-    assert len(grouped(instance, replace(few, further_objects=1))[1]) == 1
-    assert grouped(instance[instance != 9], config) == ([], [])  # three objects tell no category
-    assert grouped(torch.arange(40), config) == ([], [])
+    assert grouped(instance[instance != 9], config) == []  # three objects tell no category
+    assert grouped(torch.arange(40), config) == []
 
 
 @pytest.mark.parametrize("each", [5, 8])
@@ -98,7 +93,7 @@ def test_clouds_are_grouped_where_each_object_shows_enough(
     told: list[int] = []
 
     def discovering(*args: Any) -> NoReturn:
-        told.extend(len(views.points) for views in args[4].known)
+        told.extend(len(views.points) for views in args[4])
         raise InterruptedError
 
     monkeypatch.setattr(method, "discover", discovering)
