@@ -40,6 +40,7 @@ from scapo.registered.view_network import (
     ViewTarget,
     ViewVotes,
     along_rays,
+    base_by_votes,
     placed_by_votes,
     view_losses,
 )
@@ -264,8 +265,8 @@ def voted(
     turn = (roll[:, None] @ seen.views.look).flatten(0, 1)  # (L B, 3, 3)
     points, normals = (x.repeat(looks, 1, 1) @ turn.mT for x in (seen.clean, seen.normals))
     votes = network(points, normals, points.shape[1])
-    placement, sure = placed_by_votes(votes, points, template)
-    rotation = (turn.mT @ placement.rotation).unflatten(0, (looks, -1))
+    rotation, sure = base_by_votes(votes, points)
+    rotation = (turn.mT @ rotation).unflatten(0, (looks, -1))
     sure = sure.unflatten(0, (looks, -1))
     best = rotation[sure.argmax(0), torch.arange(sure.shape[1], device=sure.device)]
     weight = (rotation_angle(rotation, best.expand_as(rotation)) < OTHER_WAY) * sure.clamp_min(TINY)

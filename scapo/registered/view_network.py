@@ -264,7 +264,21 @@ def placed_by_votes(
         shift=votes.shift,
         deviation=votes.deviation,
     )
-    return placement, torch.exp(-(off / GOOD).square()).mean(1)
+    return placement, _agreement(off)
+
+
+@torch.no_grad()
+def base_by_votes(
+    votes: ViewVotes, points: Float[Tensor, "B K 3"]
+) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, " B"]]:
+    """view_R_base of `placed_by_votes`, and how well the votes of the bases agree, 1 to 0."""
+    base = votes.part.softmax(-1)[..., 0]
+    rotation, _, off = _fitted(points, votes.points[:, :, 0], base)
+    return rotation, _agreement(off)
+
+
+def _agreement(off: Float[Tensor, "B K"]) -> Float[Tensor, " B"]:
+    return torch.exp(-(off / GOOD).square()).mean(1)
 
 
 def _fitted(
