@@ -182,10 +182,10 @@ def _how_objects_stand(
     best: Candidate, known: list[OneObject], course: Course
 ) -> OrientationScorer | None:
     """What tells of any view how it stands, learned from objects, in the final template's frame."""
-    views = owned_views(known, ASKED).views
-    searching = partial(search_near, best, views, journal=course.journal)
+    asked = owned_views(known, ASKED)
+    searching = partial(search_near, best, asked.views, journal=course.journal)
     hypotheses, kinds = course.step("search of objects", searching), best.template.kinds
-    taught = partial(taught_by_objects, known, kinds, hypotheses, course.generator)
+    taught = partial(taught_by_objects, known, kinds, asked, hypotheses, course.generator)
     return course.step("how objects stand", taught)
 
 

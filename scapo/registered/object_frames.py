@@ -21,9 +21,9 @@ import torch
 
 from scapo.categories import JointKind
 from scapo.records import cat
-from scapo.registered.objects import OneObject, agreeing, owned_views
+from scapo.registered.objects import OneObject, agreeing
 from scapo.registered.orientation import OrientationScorer
-from scapo.registered.pose_search import Hypotheses
+from scapo.registered.pose_search import Hypotheses, OwnedViews
 from scapo.registered.synchronisation import densest
 
 logger = logging.getLogger(__name__)
@@ -35,6 +35,7 @@ LEAST_SPREAD = 0.7  # Variance of an object's cameras against single views' with
 def taught_by_objects(
     known: Sequence[OneObject],
     kinds: tuple[JointKind, ...],
+    asked: OwnedViews,
     hypotheses: Hypotheses,
     generator: torch.Generator,
 ) -> OrientationScorer | None:
@@ -43,10 +44,10 @@ def taught_by_objects(
     Args:
         known: The objects.
         kinds: Of their joints.
-        hypotheses: Of some of their views (`owned_views` of `ASKED`), in the template's frame.
+        asked: Some of their views.
+        hypotheses: Of these, in the template's frame.
         generator: On the host.
     """
-    asked = owned_views(known, ASKED)
     loss = hypotheses.loss + hypotheses.unlike
     rotation = hypotheses.placement.rotation.unflatten(0, loss.shape)
     alone = rotation[torch.arange(len(loss)), loss.argmin(1)]  # view_R_template

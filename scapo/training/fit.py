@@ -165,6 +165,7 @@ class Trainer:
     def run(self, *, resume: bool) -> None:
         """All stages that are left."""
         finished, moments = False, None
+        precision.require_networks(self.method, self.config.arithmetic)
         with self._explained():
             if self.folder.found(resume=resume):
                 finished, moments = self.folder.load(self.state, self.ranks.rank)
@@ -175,10 +176,7 @@ class Trainer:
             self.ranks.wait()  # no rank looks for a run that another has begun
             path = self.folder.path if self.ranks.first else None
             self.log = Log(path, self.state.position.step, self.ranks.total)
-            with (
-                contextlib.closing(self.log),
-                precision.applied(self.method, self.config.arithmetic, self.config.device),
-            ):
+            with contextlib.closing(self.log):
                 self._stages(moments)
 
     @contextlib.contextmanager
@@ -206,7 +204,10 @@ class Trainer:
             if moments is not None:
                 checkpoint.load_optimiser(optimizer, moments, self.folder.path)
                 moments = None
-            self._stage(stage, optimizer)
+            # Not the start: what it does side by side sends the method to other processes.
+            arithmetic, device = self.config.arithmetic, self.config.device
+            with precision.applied(self.method, arithmetic, device):
+                self._stage(stage, optimizer)
             self._take_best()
             position.stage, position.epoch, position.started = position.stage + 1, 0, False
             self._draw(stage)

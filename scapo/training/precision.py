@@ -38,12 +38,11 @@ class Arithmetic:
     """Float32 matrix products of networks with 10-bit mantissas, on CUDA alone."""
 
 
-@contextmanager
-def applied(method: AbstractMethod, arithmetic: Arithmetic, device: str) -> Iterator[None]:
-    """Compute the method's networks in that way within the block.
+def require_networks(method: AbstractMethod, arithmetic: Arithmetic) -> None:
+    """Refuse a change of networks that the method does not name.
 
     Raises:
-        ValueError: The method names no networks, so that there is nothing to change.
+        ValueError: It names none, so that there is nothing to change.
     """
     reduced = arithmetic.precision != "float32"
     if (reduced or arithmetic.compiled) and not method.networks and method.stages():
@@ -52,6 +51,14 @@ def applied(method: AbstractMethod, arithmetic: Arithmetic, device: str) -> Iter
             f"{asked}: expected a method with networks that may be changed, found {method.name}, "
             "which names none"
         )
+
+
+@contextmanager
+def applied(method: AbstractMethod, arithmetic: Arithmetic, device: str) -> Iterator[None]:
+    """Compute the method's networks in that way within the block.
+
+    There the method cannot be sent to another process.
+    """
     networks = [method.get_submodule(name) for name in method.networks]
     for network in networks:
         network.forward = changed(network.forward, arithmetic, torch.device(device).type)

@@ -81,8 +81,9 @@ def by_objects(
         for rows in grouped(instance, config)
     ]
     known = surest_first([one_object(views, kinds, config, generator) for views in first])
-    hypotheses = search(method.template, owned_views(known, ASKED).views, space)
-    scorer = taught_by_objects(known, kinds, hypotheses, generator)
+    asked = owned_views(known, ASKED)
+    hypotheses = search(method.template, asked.views, space)
+    scorer = taught_by_objects(known, kinds, asked, hypotheses, generator)
     if scorer is None:
         raise AssertionError("however their cameras lie, they teach")
     return scorer

@@ -16,7 +16,7 @@ from scapo.method import evenly
 from scapo.records import take
 from scapo.registered import object_frames
 from scapo.registered.object_frames import taught_by_objects
-from scapo.registered.objects import OneObject
+from scapo.registered.objects import OneObject, owned_views
 from scapo.registered.orientation import (
     CHARGE,
     MOST,
@@ -149,24 +149,22 @@ def placed_so(frames: Tensor) -> Hypotheses:
     return Hypotheses(placement=placement, loss=loss, unlike=torch.zeros_like(loss))
 
 
+ASKED = 4  # Views of each object that tell how the template is turned
+
+
 def taught(
-    objects: list[OneObject], turns: Tensor, frames: Tensor, patch: pytest.MonkeyPatch
+    objects: list[OneObject], turns: Tensor, placed: Tensor, patch: pytest.MonkeyPatch
 ) -> OrientationScorer | None:
-    """By objects that are read with these turns, of whose first views some are placed so."""
+    """By objects that are read with these turns, whose views are placed so."""
 
     def readings(some: list[OneObject], kinds: object) -> list[object]:
         del kinds
         return [type("Reading", (), {"turn": turns[k].mT})() for k in range(len(some))]
 
     patch.setattr(object_frames, "agreeing", readings)
-    patch.setattr(object_frames, "ASKED", len(frames))
-    return taught_by_objects(objects, ("revolute",), placed_so(frames), generator(8))
-
-
-def asked_of(rotation: Tensor, each: int) -> Tensor:
-    """As `owned_views` takes them: so many of each object's views, evenly."""
-    rows = torch.arange(COUNT * EACH).unflatten(0, (COUNT, EACH))[:, evenly(EACH, each)]
-    return rotation[rows.flatten()]
+    asked = owned_views(objects, ASKED * COUNT)
+    placed = placed.unflatten(0, (COUNT, EACH))[:, evenly(EACH, ASKED)].flatten(0, 1)
+    return taught_by_objects(objects, ("revolute",), asked, placed_so(placed), generator(8))
 
 
 @pytest.mark.slow
@@ -181,7 +179,7 @@ def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -
     mistaken = rotation.clone()
     mistaken[wrong.repeat_interleave(EACH)] @= quarter_turns()[5]
     other = rotvec_to_rotmat(torch.tensor([[0.7, -0.2, 0.4]]))[0]
-    scorer = taught(objects, turns @ other, asked_of(mistaken, 4), monkeypatch)
+    scorer = taught(objects, turns @ other, mistaken, monkeypatch)
     assert scorer is not None
     views, _ = standing(COUNT * EACH, 6)
     others, truth = standing(60, 9)
@@ -198,7 +196,7 @@ def test_objects_whose_cameras_gather_do_not_teach(
     objects, rotation = objects_of_chairs(turns)
     if gathered:
         objects = [replace(one, posed=replace(one.posed, rotation=facing(one))) for one in objects]
-    told = taught(objects, turns, asked_of(rotation, 4), monkeypatch)
+    told = taught(objects, turns, rotation, monkeypatch)
     assert (told is None) == gathered
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,13 @@ from scapo.store.checkpoint import TRAINING, WEIGHTS
 from scapo.store.files import read_header
 from scapo.training import fit
 from scapo.training import precision as precision_module
-from scapo.training.precision import Arithmetic, Precision, applied, full
+from scapo.training.precision import (
+    Arithmetic,
+    Precision,
+    applied,
+    full,
+    require_networks,
+)
 from scapo.types import Labels, Observation
 from tests.conftest import REPOSITORY
 from tests.helpers.tiny import tiny, tiny_data
@@ -130,8 +137,28 @@ def test_a_method_without_networks_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="bfloat16: expected a method with networks"):
         fit.fit(method, tiny_data(), tmp_path, config)
     icp = Icp(IcpConfig(), CATEGORIES["laptop"], torch.Generator())
-    with applied(icp, Arithmetic(compiled=True), "cpu"):  # nothing is trained: nothing to refuse
-        pass
+    require_networks(icp, Arithmetic(compiled=True))  # nothing is trained: nothing to refuse
+
+
+class Sent(Line):
+    """Its starts send its network to another process."""
+
+    def start(
+        self, stage: str, observation: Observation, labels: Labels, generator: torch.Generator
+    ) -> None:
+        assert len(ForkingPickler.dumps(self.map))
+        self.sent = [*getattr(self, "sent", []), stage]
+        super().start(stage, observation, labels, generator)
+
+
+def test_starts_may_send_networks_to_other_processes(tmp_path: Path) -> None:
+    method = Sent()
+    fit.fit(
+        method, tiny_data(), tmp_path, replace(CONFIG, arithmetic=Arithmetic(precision="bfloat16"))
+    )
+    assert method.sent == ["one", "two"]
+    with applied(method, Arithmetic(precision="bfloat16"), "cpu"), pytest.raises(AttributeError):
+        ForkingPickler.dumps(method.map)
 
 
 def test_only_half_precision_is_widened() -> None:
