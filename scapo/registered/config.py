@@ -180,7 +180,7 @@ class RegisteredConfig(SearchConfig):
 
 
 def cpu_config() -> RegisteredConfig:
-    """Trains one category in 10 to 14 minutes on two cores."""
+    """Trains one category in 9 to 14 minutes on two cores."""
     return RegisteredConfig()
 
 

@@ -9,7 +9,8 @@ objects look like then tells single views of others (`orientation`).
 
 Where views of two sides of an object were taken for one side, its frame is wrong, and its cameras
 gather. So objects teach only where their cameras are spread nearly as widely as those of single
-views are: of drawers 0.87, of washers, on which views know better, 0.47.
+views are: of ovens, safes and drawers 0.96 to 1.08, of suitcases 0.73, of washers, on which views
+know better, about half.
 """
 
 from __future__ import annotations
