@@ -65,7 +65,7 @@ def seen_from_above() -> tuple[Candidates, list[ObjectFrame], Tensor, Tensor]:
     g, count = generator(0), OBJECTS * EACH
     truth = random_rotations(count, g)
     way = random_rotations(OBJECTS, g)  # object_R_template
-    camera = truth @ (torch.randn(count, 3, generator=g) * 0.3 + ABOVE)[..., None]
+    camera = truth @ (torch.randn(count, 3, generator=g) * 0.1 + ABOVE)[..., None]
     axes = torch.eye(3).repeat_interleave(FRAME_EVERY, 0)  # of a box that stands in that frame
     views = PartialViews(
         points=torch.zeros(count, len(axes), 3),
