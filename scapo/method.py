@@ -135,7 +135,7 @@ class Stage:
     weight_decay: float = 1e-8
     batch: int = 16
     clouds: int | None = None
-    """How many of the training clouds, evenly spread (`evenly`), it uses; None: all."""
+    """Samples of an epoch: training clouds, evenly spread (`rows`); None: all."""
     parameters: tuple[ParameterGroup, ...] = (ParameterGroup(module=""),)
     optimiser: Adam | Sgd = Adam()
     schedule: HalfCosine | StepDecay = HalfCosine()
@@ -257,6 +257,13 @@ class AbstractMethod(nn.Module, ABC):
             labels: As allowed by `supervision`.
             generator: On the device of the clouds.
         """
+
+    def rows(self, stage: Stage, total: int) -> Int[Tensor, " K"]:
+        """Which of so many training clouds a stage that was started learns from, one or more.
+
+        An epoch has `stage.clouds` samples all the same; fewer rows come again in it.
+        """
+        return evenly(total, stage.clouds)
 
     @abstractmethod
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import Category, JointKind
@@ -59,12 +59,7 @@ from scapo.registered.pose_search import (
 )
 from scapo.registered.pseudo_labels import Candidates, LearnedClouds, PseudoLabels, ViewTargets
 from scapo.registered.surfaces import lying
-from scapo.registered.template import (
-    ArticulatedTemplate,
-    Placement,
-    interleave,
-    turn_placement,
-)
+from scapo.registered.template import ArticulatedTemplate, Placement, interleave, turn_placement
 from scapo.registered.upright import Upright
 from scapo.registered.view_bank import ShownPoints
 from scapo.registered.view_network import ViewNetwork
@@ -291,6 +286,11 @@ class AbstractRegistered(AbstractMethod):
         """Keep of the training clouds what `quick` and `refine` look at: those placed surely."""
         self.pseudo.keep_trusted()
         self.targets.clear()
+
+    def rows(self, stage: Stage, total: int) -> Int[Tensor, " K"]:
+        """Those whose placements are trusted."""
+        trust = self.targets.trust if isinstance(self.network, ViewNetwork) else self.pseudo.trust
+        return super().rows(stage, total)[(trust > 0).cpu()]
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`learning`)."""

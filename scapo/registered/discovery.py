@@ -33,6 +33,7 @@ from scapo.registered.config import DiscoveryConfig
 from scapo.registered.course import JUDGES, Course, are_alike, numbered, plan_of
 from scapo.registered.halves import are_halves, in_halves, may_have_halves
 from scapo.registered.initialisation import common_frame, fitted_proposals
+from scapo.registered.inliers import OwnedViews, Searched, find_inliers
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.mirror_images import mirrored, paired
 from scapo.registered.object_frames import ASKED, taught_by_objects
@@ -45,14 +46,7 @@ from scapo.registered.objects import (
     surest_first,
 )
 from scapo.registered.orientation import OrientationScorer
-from scapo.registered.pose_search import (
-    Searched,
-    SearchResult,
-    find_inliers,
-    search_near,
-    search_views,
-    unexplained,
-)
+from scapo.registered.pose_search import SearchResult, search_near, search_views, unexplained
 from scapo.registered.template import ArticulatedTemplate
 from scapo.registered.views import PartialViews
 
@@ -93,15 +87,16 @@ def discover(
     course = Course(kinds, generator, plan, journal)
     judges, others = held_out(views, config.judged)
     total = len(others.points)
-    known = list[OneObject]()
+    shown = None
     half: Searched = take(others, evenly(total, config.searched // 2))
     searched: Searched = take(others, evenly(total, config.searched))
     if objects:
         config = replace(config, way_out=False)  # the objects' own motions tell the axes
         known = _known_objects(objects, kinds, config, course)
         tried = _of_objects(known, kinds, config, course)
-        half = owned_views(known[: len(known) // 2], config.searched // 2)
-        searched = owned_views(known, config.searched)
+        shown = owned_views(known, kinds)
+        half = shown.some(config.searched // 2, objects=len(known) // 2)
+        searched = shown.some(config.searched)
     else:
         tried = _of_draws(others, kinds, config, course)
     best = _best(tried, judges, half, config, course)
@@ -111,7 +106,7 @@ def discover(
     if config.leans and "revolute" in kinds:
         deviating = partial(with_axis_deviation, best, judges, config, generator, journal)
         best = course.step("deviating axes", deviating)
-    scorer = _how_objects_stand(best, known, course) if known else None
+    scorer = _how_objects_stand(best, shown, course) if shown else None
     searching = partial(search_views, best, views, scorer, journal)
     found = course.step("search of all views", searching)
     return Discovery(template=best.template, found=found, scorer=scorer)
@@ -179,13 +174,13 @@ def _of_objects(
 
 
 def _how_objects_stand(
-    best: Candidate, known: list[OneObject], course: Course
+    best: Candidate, known: OwnedViews, course: Course
 ) -> OrientationScorer | None:
     """What tells of any view how it stands, learned from objects, in the final template's frame."""
-    asked = owned_views(known, ASKED)
+    asked = known.some(ASKED)
     searching = partial(search_near, best, asked.views, journal=course.journal)
-    hypotheses, kinds = course.step("search of objects", searching), best.template.kinds
-    taught = partial(taught_by_objects, known, kinds, asked, hypotheses, course.generator)
+    hypotheses = course.step("search of objects", searching)
+    taught = partial(taught_by_objects, known, asked, hypotheses, course.generator)
     return course.step("how objects stand", taught)
 
 

@@ -200,6 +200,9 @@ class TemplateRegistration(AbstractRegistered):
         if self._frames is None:
             self._frames = self._frames_of(cloud, known, generator)
         frames, ways = how_objects_stand(self._frames, self.orientation)
+        if not frames:
+            logger.warning("how objects stand is not known: the views of none are of one mind")
+            return super()._trusted(found, cloud, labels, generator)
         agrees = agreeing(found, frames, ways)[1]
         row, wanted = against(agrees, frames, ways)
         said = "%.0f %% of the clouds stand as their objects do; %d more are asked whether they may"

@@ -27,9 +27,9 @@ from scapo.records import cat, take
 from scapo.registered.bundle_adjustment import Candidate, Inliers, first_fit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import common_frame, first_template
+from scapo.registered.inliers import OwnedViews
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
 from scapo.registered.orientation import quarter_turns
-from scapo.registered.pose_search import OwnedViews
 from scapo.registered.template import SPAN, Placement
 from scapo.registered.view_states import Motion, apart, motion_of
 from scapo.registered.views import TINY, PartialViews
@@ -109,16 +109,16 @@ class _Start:
         return replace(still, log_scale=self.log_scale.clone())
 
 
-def owned_views(objects: Sequence[OneObject], count: int) -> OwnedViews:
-    """So many views of the objects, as many of each, or all."""
-    each = max(1, count // len(objects))
-    rows = [evenly(len(one.posed.rotation), each) for one in objects]
-    some = [take(one.posed, index) for one, index in zip(objects, rows, strict=True)]
-    owner = [torch.full((len(index),), k) for k, index in enumerate(rows)]
+def owned_views(objects: Sequence[OneObject], kinds: tuple[JointKind, ...]) -> OwnedViews:
+    """All views of the objects, as these stand when they are read together (`agreeing`)."""
+    posed, readings = [one.posed for one in objects], agreeing(objects, kinds)
+    number = [torch.full((len(one.rotation),), k) for k, one in enumerate(posed)]
+    turned = [one.rotation @ x.turn.mT for one, x in zip(posed, readings, strict=True)]
     return OwnedViews(
-        views=cat([posed.views for posed in some]),
-        rotation=torch.cat([posed.rotation for posed in some]),
-        owner=torch.cat(owner),
+        views=cat([one.views for one in posed]),
+        rotation=torch.cat(turned),
+        owner=torch.cat(number),
+        variance=float(torch.stack([one.cameras().var(0).sum() for one in objects]).mean()),
     )
 
 

@@ -13,12 +13,12 @@ from functools import partial
 from itertools import product
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.method import NO_JOURNAL, Journal, evenly
 from scapo.records import cat, take
-from scapo.registered.bundle_adjustment import Candidate, Inliers
+from scapo.registered.bundle_adjustment import Candidate
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.joint_limits import JointLimits, limits_of, narrowest_limits
 from scapo.registered.orientation import OrientationScorer
@@ -31,7 +31,6 @@ from scapo.registered.pose_refinement import (
     refine,
     search_states,
 )
-from scapo.registered.synchronisation import densest
 from scapo.registered.template import ArticulatedTemplate, Placement, interleave
 from scapo.registered.upright import LEANING, OVER, Upright
 from scapo.registered.view_bank import ShownPoints, ViewBank
@@ -99,9 +98,6 @@ STATES = (150.0, 250.0)  # Sharpness of the losses by which the winner's states 
 STATE_GRID, STATE_EVERY = 13, 2
 """States that are tried then, and one in so many points that they are tried with."""
 STATE_STEPS = StepOptions(steps=5, points=256)  # Steps that follow
-VOTE = 30.0  # How sharply the losses of a view's hypotheses share its vote
-AGREES = 25.0  # Degrees from the object's frame within which a hypothesis agrees with it
-MORE = 0.3  # Share of the views that agree with others of their object, beyond that of bare views
 LOSS_SHARE = 0.5  # Of a placement's loss that counts against its margin when views are ranked
 LEAST_INLIERS = 8  # Views that a template is fitted to at least
 
@@ -190,24 +186,19 @@ class Hypotheses:
             unlike=torch.cat([self.unlike, others.unlike], 1),
         )
 
+    def rotation(self) -> Float[Tensor, "B F 3 3"]:
+        """view_R_template of all."""
+        return self.placement.rotation.unflatten(0, self.loss.shape)
+
+    def best_rotation(self) -> Float[Tensor, "B 3 3"]:
+        """view_R_template of the best of each view, whatever its states."""
+        best = (self.loss + self.unlike).argmin(1)
+        return self.rotation()[torch.arange(len(best), device=best.device), best]
+
     def best(self, limits: JointLimits) -> SearchResult:
         """The best of each view; those with states outside the limits are charged for it."""
         loss = self.loss + limits.penalty(self.placement.state.unflatten(0, self.loss.shape))
         return best_of(self.placement, loss, self.unlike)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OwnedViews:
-    """Views of several objects, each with its pose in the frame of its own object."""
-
-    views: PartialViews
-    rotation: Float[Tensor, "B 3 3"]
-    """view_R_object"""
-    owner: Int[Tensor, " B"]
-    """Which object a view shows."""
-
-
-Searched = PartialViews | OwnedViews
 
 
 def best_of(
@@ -232,64 +223,6 @@ def most_confident(found: SearchResult, share: float) -> Int[Tensor, " K"]:
     return rank_by_confidence(found)[: max(LEAST_INLIERS, round(share * len(found.loss)))]
 
 
-def voted(
-    hypotheses: Hypotheses, limits: JointLimits, searched: OwnedViews
-) -> tuple[SearchResult, Bool[Tensor, " B"]]:
-    """Of each view the hypothesis that most views of its object agree with.
-
-    Single views look alike under turns that differ from view to view; the object's frame in the
-    template is the same for all of them.
-
-    Returns:
-        The placements, and whether a view has a hypothesis that agrees at all.
-    """
-    count = len(searched.owner)
-    state = hypotheses.placement.state.unflatten(0, (count, -1))
-    loss = hypotheses.loss + limits.penalty(state)
-    rotation = hypotheses.placement.rotation.unflatten(0, loss.shape)
-    frames = rotation.mT @ searched.rotation[:, None]  # template_R_object
-    vote = torch.softmax(-VOTE * (loss + hypotheses.unlike), 1)
-    trace = torch.zeros_like(loss)  # With the object's frame
-    for number in searched.owner.unique():
-        own = searched.owner == number
-        frame, _ = densest(frames[own].flatten(0, 1), vote[own].flatten())
-        trace[own] = (frames[own] * frame).sum((-1, -2))
-    agrees = within(trace, AGREES)
-    unlike = hypotheses.unlike + NO_RIVAL * ~agrees
-    return best_of(hypotheses.placement, loss, unlike), agrees.any(1)
-
-
-def find_inliers(
-    candidate: Candidate,
-    searched: Searched,
-    share: float,
-    config: DiscoveryConfig,
-    *,
-    anywhere: bool = False,
-    journal: Journal = NO_JOURNAL,
-) -> Candidate:
-    """The template with that share of the views as inliers, those that it explains best.
-
-    Args:
-        candidate: A template with its present inliers, whose states and cameras bound the search.
-        searched: B views.
-        share: Of them.
-        config: Rotations, and the cost of a range of states.
-        anywhere: Whether cameras are sought anywhere.
-        journal: Of the training.
-    """
-    views = searched.views if isinstance(searched, OwnedViews) else searched
-    hypotheses = search_near(candidate, views, anywhere=anywhere, journal=journal)
-    found, limits = _within_limits(candidate, hypotheses, config)
-    if isinstance(searched, OwnedViews):
-        found, agrees = voted(hypotheses, limits, searched)
-        rows = agrees.nonzero()[:, 0]
-        found, views, share = take(found, rows), take(views, rows), min(1.0, share + MORE)
-    kept = most_confident(found, share)
-    inliers = Inliers(views=take(views, kept), placement=take(found.placement, kept))
-    return Candidate(template=candidate.template, inliers=inliers)
-
-
 def search_views(
     candidate: Candidate,
     views: PartialViews,
@@ -309,7 +242,7 @@ def unexplained(candidate: Candidate, views: PartialViews, config: DiscoveryConf
     several joints by how much each moves; and so does, for joints of one kind, how far from
     parallel they are.
     """
-    found, limits = _within_limits(candidate, search_near(candidate, views), config)
+    found, limits = within_limits(candidate, search_near(candidate, views), config)
     extent = limits.extent(surface_moved(candidate.template))
     cost = config.range_cost * extent + config.askew_cost * askew(candidate.template)
     return float(found.loss.mean()) + cost
@@ -336,7 +269,7 @@ def askew(template: ArticulatedTemplate) -> float:
     return sum(1 - abs(float(axes[i] @ axes[j])) for i, j in alike)
 
 
-def _within_limits(
+def within_limits(
     candidate: Candidate, hypotheses: Hypotheses, config: DiscoveryConfig
 ) -> tuple[SearchResult, JointLimits]:
     """The best hypotheses within the narrowest joint limits, and those."""

@@ -31,6 +31,7 @@ from scapo.registered.views import PartialViews
 NEAR = 30.0  # Degrees from its object's way within which a candidate says the same
 AGAINST = 1.0  # Loss that another candidate costs
 LEAST_NATS = -4.0  # What a view can hold against a way at most
+LEAST_SHARE = 0.6  # Of an object's views that say the same as all; where fewer do, all may be wrong
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +68,7 @@ def frame_of(row: Int[Tensor, " N"], views: PartialViews, rotations: int) -> Obj
 def how_objects_stand(
     frames: Sequence[ObjectFrame], scorer: OrientationScorer
 ) -> tuple[list[ObjectFrame], list[Float[Tensor, "3 3"]]]:
-    """The objects, with those of their views that say the same as all, and object_R_template.
+    """The objects whose views are of one mind, without the others, and object_R_template.
 
     Args:
         frames: Of objects.
@@ -79,8 +80,10 @@ def how_objects_stand(
         every = principal_frame(normals.flatten(0, 1)).mT @ quarter_turns()
         nats = scorer(one.views, one.turn[:, None] @ every).log_softmax(-1)
         likely = int(nats.clamp_min(LEAST_NATS).mean(0).argmax())
-        kept.append(take(one, nats.argmax(1) == likely))
-        ways.append(every[likely])
+        same = nats.argmax(1) == likely
+        if float(same.float().mean()) >= LEAST_SHARE:
+            kept.append(take(one, same))
+            ways.append(every[likely])
     return kept, ways
 
 

@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
+from jaxtyping import Int
 from safetensors.numpy import load, save
 from torch import Tensor
 from torch.optim import Optimizer
 
-from scapo.method import AbstractMethod, Journal, Stage, Step, evenly
+from scapo.method import AbstractMethod, Journal, Stage, Step
 from scapo.store import checkpoint
 from scapo.store.files import Arrays
 from scapo.store.samples import TrainingData
@@ -257,8 +258,8 @@ class Trainer:
     def _stage(self, stage: Stage, optimizer: Optimizer) -> None:
         """The epochs of a stage that are left."""
         position = self.state.position
-        used = evenly(self.data.observation.points.shape[0], stage.clouds)
-        samples = len(used)
+        total = self.data.observation.points.shape[0]
+        used, samples = self.method.rows(stage, total), min(total, stage.clouds or total)
         size = min(stage.batch, samples)
         if size < self.ranks.count:
             raise ValueError(
@@ -268,7 +269,7 @@ class Trainer:
         for epoch in range(position.epoch, stage.epochs):
             began = time.monotonic()
             self.method.train()
-            order = used[torch.randperm(samples, generator=self.state.order)[: steps * size]]
+            order = used[self._order(len(used), samples)[: steps * size]]
             for number, index in enumerate(order.split(size)):
                 done = (epoch * steps + number) / (stage.epochs * steps)
                 self._step(stage, optimizer, index, done)
@@ -287,6 +288,11 @@ class Trainer:
             every = self.config.pictures_every
             if every is not None and self._due(self.drawn, every) and epoch + 1 < stage.epochs:
                 self._draw(stage)
+
+    def _order(self, count: int, samples: int) -> Int[Tensor, " N"]:
+        """So many numbers below `count`, or more: all in random order, and again."""
+        passes = range(-(-samples // count))
+        return torch.cat([torch.randperm(count, generator=self.state.order) for _ in passes])
 
     @torch.no_grad()
     def _validate(self, stage: Stage) -> None:

@@ -81,9 +81,10 @@ def by_objects(
         for rows in grouped(instance, config)
     ]
     known = surest_first([one_object(views, kinds, config, generator) for views in first])
-    asked = owned_views(known, ASKED)
+    shown = owned_views(known, kinds)
+    asked = shown.some(ASKED)
     hypotheses = search(method.template, asked.views, space)
-    scorer = taught_by_objects(known, kinds, asked, hypotheses, generator)
+    scorer = taught_by_objects(shown, asked, hypotheses, generator)
     if scorer is None:
         raise AssertionError("however their cameras lie, they teach")
     return scorer

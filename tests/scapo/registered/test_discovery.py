@@ -22,9 +22,10 @@ from scapo.registered.discovery import (
     ranked,
 )
 from scapo.registered.initialisation import fitted_proposals
+from scapo.registered.inliers import find_inliers
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.mirror_images import mirrored
-from scapo.registered.pose_search import SearchResult, find_inliers
+from scapo.registered.pose_search import SearchResult
 from scapo.registered.views import PartialViews
 from tests.helpers.sighted import AXIS, sighted, template, without_a_side
 from tests.helpers.strategies import generator

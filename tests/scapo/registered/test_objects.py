@@ -14,6 +14,7 @@ from scapo.geometry.rigid import axis_angle, random_rotations, rotation_angle
 from scapo.registered import joint_proposals, method
 from scapo.registered import objects as room
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig
+from scapo.registered.inliers import OwnedViews, voted
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.joint_proposals import JointProposal, PosedViews
 from scapo.registered.method import TemplateRegistration
@@ -27,7 +28,7 @@ from scapo.registered.objects import (
     surest_first,
 )
 from scapo.registered.orientation import quarter_turns
-from scapo.registered.pose_search import Hypotheses, voted
+from scapo.registered.pose_search import Hypotheses
 from scapo.registered.template import Placement
 from scapo.registered.view_states import Motion
 from scapo.types import Labels, Observation
@@ -107,39 +108,64 @@ def test_clouds_are_grouped_where_each_object_shows_enough(
     assert ("too few clouds" in caplog.text) == (each == 5)
 
 
-def test_views_of_each_object_are_owned_by_it() -> None:
-    some = [known(torch.eye(3), seed, (0.2, 0.1, 0.1)) for seed in range(3)]
-    shown = owned_views(some, 12)
-    assert shown.owner.tolist() == [0] * 4 + [1] * 4 + [2] * 4
-    assert torch.equal(shown.rotation[4], some[1].posed.rotation[0])
-    assert torch.equal(shown.views.points[7], some[1].posed.views.points[5])
+def test_views_of_each_object_are_owned_by_it_and_stand_in_one_frame() -> None:
+    picked = [quarter_turns()[k] for k in (0, 5, 16)]
+    some = [known(turn, seed, (0.2, 0.1, 0.1)) for seed, turn in enumerate(picked)]
+    shown = owned_views(some, ("revolute",))
+    assert shown.owner.tolist() == [0] * 6 + [1] * 6 + [2] * 6
+    assert torch.equal(shown.views.points[7], some[1].posed.views.points[1])
+    truth = torch.cat([sighted(6, seed=seed)[1].rotation for seed in range(3)])
+    frame = shown.rotation.mT @ truth  # common_R_template
+    assert torch.allclose(frame, frame[:1].expand(18, 3, 3), atol=1e-5)
+    cameras = torch.stack([one.cameras().var(0).sum() for one in some])
+    assert shown.variance == pytest.approx(float(cameras.mean()))
+    assert shown.some(6).owner.tolist() == [0, 0, 1, 1, 2, 2]
+    assert shown.some(99, objects=2).owner.tolist() == [0] * 6 + [1] * 6
 
 
-def test_views_of_one_object_outvote_turns_that_single_views_prefer() -> None:
-    """Every view has its true pose and three others, one of which it likes better in 4 of 10."""
+def turned_views(variance: float) -> tuple[OwnedViews, Hypotheses, torch.Tensor]:
+    """Ten views of two objects; each has its true pose and three others; and the true rotations.
+
+    Three views of the second object like the same wrong turn of it better than the true one.
+    """
     g = generator(0)
     shown = replace(
-        owned_views([known(torch.eye(3), 0, (0.2, 0.1, 0.1))], 6),
-        rotation=random_rotations(10, g),
-        owner=torch.tensor([0] * 5 + [1] * 5),
-    )
-    frame = random_rotations(2, g)[shown.owner]  # template_R_object of two objects
-    true = shown.rotation @ frame.mT
+        owned_views([known(torch.eye(3), k, (0.2, 0.1, 0.1)) for k in range(2)], ("revolute",)),
+        variance=variance,
+    ).some(10)
+    shown = replace(shown, rotation=random_rotations(10, g), owner=torch.arange(10) // 5)
+    true = shown.rotation @ random_rotations(1, g).mT
     rotation = torch.cat([true[:, None], random_rotations(30, g).view(10, 3, 3, 3)], 1)
+    rotation[5:, 1] = shown.rotation[5:] @ random_rotations(1, g).mT
     loss = torch.full((10, 4), 0.5)
-    loss[:, 0], loss[::5, 1], loss[1::5, 2] = 0.4, 0.38, 0.38
+    loss[:, 0], loss[0, 2], loss[5:8, 1], loss[8:, 1] = 0.4, 0.38, 0.36, 0.41
     turn = rotation.flatten(0, 1)
     placement = Placement.at(turn, torch.zeros(40, 3), torch.zeros(40, 1))
-    hypotheses = Hypotheses(placement=placement, loss=loss, unlike=torch.zeros(10, 4))
+    return shown, Hypotheses(placement=placement, loss=loss, unlike=torch.zeros(10, 4)), true
+
+
+@pytest.mark.parametrize("gathered", [False, True])
+def test_views_of_all_objects_outvote_turns_that_one_object_prefers(gathered: bool) -> None:
+    """Unless the objects' cameras gather: then the views of each object vote alone."""
+    shown, hypotheses, true = turned_views(variance=0.0 if gathered else 9.0)
     limits = limits_of(torch.linspace(-1, 1, 10)[:, None], ("revolute",))
-    alone = hypotheses.best(limits)
-    assert int((rotation_angle(alone.placement.rotation, true) > 0.1).sum()) == 4
+    alone = hypotheses.best(limits).placement.rotation
+    assert torch.equal(alone, hypotheses.best_rotation())
+    assert int((rotation_angle(alone, true) > 0.1).sum()) == 4
     found, agrees = voted(hypotheses, limits, shown)
     assert agrees.all()
-    assert float(rotation_angle(found.placement.rotation, true).max()) < 1e-3
-    rotation[3] = random_rotations(4, g)  # a view none of whose hypotheses is right
-    turned = replace(hypotheses, placement=replace(placement, rotation=rotation.flatten(0, 1)))
-    assert voted(turned, limits, shown)[1].tolist() == [True] * 3 + [False] + [True] * 6
+    wrong = rotation_angle(found.placement.rotation, true) > 1e-3
+    assert wrong.tolist() == [False] * 5 + [gathered] * 5
+
+
+def test_a_view_none_of_whose_hypotheses_is_right_does_not_agree() -> None:
+    shown, hypotheses, _ = turned_views(variance=9.0)
+    limits = limits_of(torch.linspace(-1, 1, 10)[:, None], ("revolute",))
+    rotation = hypotheses.rotation().clone()
+    rotation[3] = random_rotations(4, generator(5))
+    placement = replace(hypotheses.placement, rotation=rotation.flatten(0, 1))
+    agrees = voted(replace(hypotheses, placement=placement), limits, shown)[1]
+    assert agrees.tolist() == [True] * 3 + [False] + [True] * 6
 
 
 def test_views_of_one_object_tell_its_frame_and_its_axis(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from scapo.geometry.rigid import random_rotations, rotation_angle
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import evenly
 from scapo.records import take
-from scapo.registered import object_frames
+from scapo.registered import objects as room
 from scapo.registered.object_frames import taught_by_objects
 from scapo.registered.objects import OneObject, owned_views
 from scapo.registered.orientation import (
@@ -161,10 +161,10 @@ def taught(
         del kinds
         return [type("Reading", (), {"turn": turns[k].mT})() for k in range(len(some))]
 
-    patch.setattr(object_frames, "agreeing", readings)
-    asked = owned_views(objects, ASKED * COUNT)
-    placed = placed.unflatten(0, (COUNT, EACH))[:, evenly(EACH, ASKED)].flatten(0, 1)
-    return taught_by_objects(objects, ("revolute",), asked, placed_so(placed), generator(8))
+    patch.setattr(room, "agreeing", readings)
+    shown = owned_views(objects, ("revolute",))
+    placed = placed[evenly(len(placed), ASKED * COUNT)]
+    return taught_by_objects(shown, shown.some(ASKED * COUNT), placed_so(placed), generator(8))
 
 
 @pytest.mark.slow

@@ -121,6 +121,21 @@ def test_all_views_of_an_object_say_how_it_stands_and_one_that_differs_is_left_o
         assert torch.equal(left.views.camera, one.views.camera[says])
 
 
+class OfTwoMinds(FromAbove):
+    """Says the contrary of every other view."""
+
+    def forward(self, views: PartialViews, rotation: Tensor) -> Tensor:
+        """How near the cameras are, or how far."""
+        sign = torch.where(torch.arange(len(rotation)) % 2 == 0, -1.0, 1.0)
+        direction = (views.direction()[:, None, None] @ rotation)[:, :, 0]
+        return 9 * sign[:, None] * (direction @ ABOVE)
+
+
+def test_objects_whose_views_are_of_two_minds_are_left_out() -> None:
+    _, frames, _, _ = seen_from_above()
+    assert how_objects_stand(frames, OfTwoMinds()) == ([], [])
+
+
 def test_candidates_against_their_object_are_charged() -> None:
     found, frames, truth, way = seen_from_above()
     charged, agrees = agreeing(found, frames[1:], list(way[1:]))

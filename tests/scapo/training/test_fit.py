@@ -9,21 +9,25 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
-from scapo.method import Stage
+from scapo.method import Stage, Step
 from scapo.store.checkpoint import TRAINING, WEIGHTS, read_checkpoint
 from scapo.store.files import read
 from scapo.store.schema import StoreError
 from scapo.training import fit
 from scapo.training.optimiser import learning_rate
 from scapo.training.run_folder import TIMING
+from scapo.types import Labels, Observation
 from tests.conftest import REPOSITORY
 from tests.helpers.tiny import TINY, tiny, tiny_data
+from tests.helpers.two_ranks import BATCH, Line
 
 CONFIG = fit.FitConfig(log_every=2, checkpoint_every=0.0, pictures_every=None)
 
@@ -80,6 +84,32 @@ def test_a_run_stopped_anywhere_continues_bit_for_bit(
         fit.fit(tiny(), tiny_data(), tmp_path, CONFIG, listener=listener)
     run(tmp_path, resume=True)
     same(whole, tmp_path)
+
+
+class Few(Line):
+    """Learns from four of its clouds, and notes which it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.shown = list[int]()
+
+    def rows(self, stage: Stage, total: int) -> Tensor:
+        return super().rows(stage, total)[[1, 2, 5, 6]]
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        self.shown += step.index.tolist()
+        return super().losses(observation, labels, step)
+
+
+def test_an_epoch_is_as_long_where_a_method_learns_from_fewer_clouds(tmp_path: Path) -> None:
+    method = Few()
+    fit.fit(method, tiny_data(10), tmp_path, CONFIG)
+    samples = 10 // BATCH * BATCH
+    assert len(method.shown) == 4 * samples  # two stages of two epochs
+    for epoch in zip(*[iter(method.shown)] * samples, strict=True):
+        first, second = Counter(epoch[:4]), Counter(epoch[4:8])
+        assert first == Counter([1, 2, 5, 6])
+        assert not second - first
 
 
 SCRIPT = """
