@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from scapo.categories import CATEGORIES
 from scapo.geometry.points import normalise, squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
-from scapo.method import Mode, Step
+from scapo.method import Mode, Step, evenly
 from scapo.registered import base
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
@@ -284,6 +284,18 @@ def test_of_many_clouds_only_the_learned_ones_have_placements():
 
 def variant(config: RegisteredConfig) -> str:
     return TemplateRegistration(config, CATEGORIES["oven"], generator(0)).variant
+
+
+def test_the_network_learns_from_placements_that_are_trusted() -> None:
+    method, _ = trained(0)
+    stage = replace(method.stages()[0], clouds=12)
+    trusted = torch.ones(12).index_fill(0, torch.tensor([0, 7]), 0.0)
+    method.targets.trust = trusted
+    assert method.rows(stage, 30).tolist() == evenly(30, 12)[trusted > 0].tolist()
+    config = replace(method.config, camera="estimated")
+    other = TemplateRegistration(config, method.category, generator(0))
+    other.pseudo.load_state_dict(method.pseudo.state_dict())
+    assert len(other.rows(stage, 30)) == 12
 
 
 def test_departures_are_named_and_a_shorter_training_is_not() -> None:
