@@ -71,7 +71,7 @@ class OwnedViews:
         """So many views or all, spread evenly, of all objects or the first so many."""
         rows = torch.arange(len(self.owner))
         rows = rows if objects is None else rows[self.owner < objects]
-        return take(self, rows[evenly(len(rows), min(count, len(rows)))])
+        return take(self, rows[evenly(len(rows), count)])
 
 
 Searched = PartialViews | OwnedViews
