@@ -104,7 +104,7 @@ REGISTERED = Entry(
     seeds=THREE,
     parts=("clean", "sensor"),
     modes=("fast", "quick", "refine"),
-    training=900,
+    training=1300,
     seconds={"fast": 0.03, "quick": 0.04, "refine": 0.1},
 )
 TOLD = replace(REGISTERED, name="registered-objects", flags=("--supervision", "instance"))
