@@ -80,7 +80,7 @@ Searched = PartialViews | OwnedViews
 def voted(
     hypotheses: Hypotheses, limits: JointLimits, searched: OwnedViews
 ) -> tuple[SearchResult, Bool[Tensor, " B"]]:
-    """Of each view the hypothesis that most views of its object agree with, and those of others.
+    """Of each view the hypothesis that its object's views vote for, what all views say counted in.
 
     Returns:
         The placements, and whether a view has a hypothesis that agrees at all.

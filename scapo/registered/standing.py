@@ -7,7 +7,7 @@ to be brought together: its shape is the same in all. Then one rotation is left 
 views, a quarter turn of the main directions of its surface. Which, a scorer tells that has learned
 how views look that stand right (`orientation`), by all views of the object: it is wrong of these
 less often than of one. Views of which it says another turn are left out: nearly half of them stand
-wrongly, of the others one in ten.
+wrongly, of the others one in ten. So are objects whose views are not of one mind.
 """
 
 from __future__ import annotations

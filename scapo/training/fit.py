@@ -290,7 +290,13 @@ class Trainer:
                 self._draw(stage)
 
     def _order(self, count: int, samples: int) -> Int[Tensor, " N"]:
-        """So many numbers below `count`, or more: all in random order, and again."""
+        """So many numbers below `count`, or more: all in random order, and again.
+
+        Raises:
+            ValueError: There is no such number.
+        """
+        if not count:
+            raise ValueError("rows: expected one cloud or more to learn from, found none")
         passes = range(-(-samples // count))
         return torch.cat([torch.randperm(count, generator=self.state.order) for _ in passes])
 

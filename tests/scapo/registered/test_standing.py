@@ -96,9 +96,12 @@ def seen_from_above() -> tuple[Candidates, list[ObjectFrame], Tensor, Tensor]:
 class FromAbove(OrientationScorer):
     """Knows where cameras are, and has seen no shape; of one view in five it says the contrary."""
 
+    every = 5
+
     def forward(self, views: PartialViews, rotation: Tensor) -> Tensor:
         """How near the cameras are, in the frames, to where they should be."""
-        sign = torch.where(torch.arange(len(rotation)) % 5 == 2, -1.0, 1.0)
+        contrary = torch.arange(len(rotation)) % self.every == self.every // 2
+        sign = torch.where(contrary, -1.0, 1.0)
         direction = (views.direction()[:, None, None] @ rotation)[:, :, 0]
         return 9 * sign[:, None] * (direction @ ABOVE)
 
@@ -122,13 +125,9 @@ def test_all_views_of_an_object_say_how_it_stands_and_one_that_differs_is_left_o
 
 
 class OfTwoMinds(FromAbove):
-    """Says the contrary of every other view."""
+    """Of one view in two."""
 
-    def forward(self, views: PartialViews, rotation: Tensor) -> Tensor:
-        """How near the cameras are, or how far."""
-        sign = torch.where(torch.arange(len(rotation)) % 2 == 0, -1.0, 1.0)
-        direction = (views.direction()[:, None, None] @ rotation)[:, :, 0]
-        return 9 * sign[:, None] * (direction @ ABOVE)
+    every = 2
 
 
 def test_objects_whose_views_are_of_two_minds_are_left_out() -> None:

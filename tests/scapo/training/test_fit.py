@@ -87,14 +87,14 @@ def test_a_run_stopped_anywhere_continues_bit_for_bit(
 
 
 class Few(Line):
-    """Learns from four of its clouds, and notes which it is shown."""
+    """Learns from some of its clouds, and notes which it is shown."""
 
-    def __init__(self) -> None:
+    def __init__(self, learned: list[int]) -> None:
         super().__init__()
-        self.shown = list[int]()
+        self.learned, self.shown = learned, list[int]()
 
     def rows(self, stage: Stage, total: int) -> Tensor:
-        return super().rows(stage, total)[[1, 2, 5, 6]]
+        return super().rows(stage, total)[self.learned]
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         self.shown += step.index.tolist()
@@ -102,7 +102,7 @@ class Few(Line):
 
 
 def test_an_epoch_is_as_long_where_a_method_learns_from_fewer_clouds(tmp_path: Path) -> None:
-    method = Few()
+    method = Few([1, 2, 5, 6])
     fit.fit(method, tiny_data(10), tmp_path, CONFIG)
     samples = 10 // BATCH * BATCH
     assert len(method.shown) == 4 * samples  # two stages of two epochs
@@ -110,6 +110,11 @@ def test_an_epoch_is_as_long_where_a_method_learns_from_fewer_clouds(tmp_path: P
         first, second = Counter(epoch[:4]), Counter(epoch[4:8])
         assert first == Counter([1, 2, 5, 6])
         assert not second - first
+
+
+def test_a_method_that_learns_from_no_cloud_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected one cloud or more to learn from, found none"):
+        fit.fit(Few([]), tiny_data(10), tmp_path, CONFIG)
 
 
 SCRIPT = """
