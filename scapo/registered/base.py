@@ -22,7 +22,7 @@ from scapo.method import NO_JOURNAL, AbstractMethod, Mode, ParameterGroup, Stage
 from scapo.pictures import PictureData
 from scapo.records import cat, map_tensors, take, without_autograd
 from scapo.registered.axis_deviation import refine_deviations
-from scapo.registered.config import SearchConfig
+from scapo.registered.config import DISSENT, SearchConfig
 from scapo.registered.decode import lying_rest, metric_limits, nearest_weights
 from scapo.registered.discovery import Discovery
 from scapo.registered.figures import template_pictures
@@ -473,7 +473,8 @@ class AbstractRegistered(AbstractMethod):
         left = successive_halving(self.template, views, start, space, by)
         if said is None:
             return left
-        charge = dissent(self.template, said, left.placement, self.config.dissent)
+        price = DISSENT if self.config.dissent is None else self.config.dissent
+        charge = dissent(self.template, said, left.placement, price)
         return replace(left, unlike=left.unlike + charge)
 
     def _without_network(self, views: PartialViews, count: int) -> Placement:

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
+from scapo.categories import Category
 from scapo.registered.joint_limits import RANGE_COST
 
 LEAST_ROTATIONS = 200
 """Of a grid: with fewer, registration would have no choice of those that it scores twice."""
+DISSENT, OBJECTS_DISSENT = 0.2, 1.0
+"""Of a network that learned the best of each view; of one that learned how objects stand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,9 +137,10 @@ class SearchConfig:
     """Such placements with which the search begins before there is a network."""
     strays: Literal["out", "kept"] = "out"
     """Whether outliers, points that do not belong to the object, are left out."""
-    dissent: float = 0.2
+    dissent: float | None = None
     """Loss that a part of a hypothesis costs which is turned another way than the network says,
-    where the network's votes agree."""
+    where the network's votes agree; None: 0.2, or 1 for one that learned how objects stand, which
+    knows better than the loss."""
     settle: bool = True
     """Try all states again for the placement that won, where no network says what they are."""
     camera: Literal["known", "estimated"] = "known"
@@ -164,10 +168,11 @@ class RegisteredConfig(SearchConfig):
     teach: Literal["all", "hinges"] = "all"
     """What of the network learns: all, or nothing but where the hinges of objects sit, which models
     that were not told instances do not know (with `start`; a few epochs of one round)."""
-    stand: Literal["views", "objects"] = "views"
+    stand: Literal["auto", "views", "objects"] = "auto"
     """What of the candidates the network learns: the best of each view, or, where it is known which
     clouds show the same object and no symmetry exchanges its parts, those that stand as the object
-    does in all of its views."""
+    does in all of its views. auto: objects where a part slides, since a box with a drawer explains
+    a view in several ways."""
     preset: Literal["cpu", "quick"] = "cpu"
     """Where the other defaults come from; quick: a training of two minutes, for trying things."""
 
@@ -177,6 +182,17 @@ class RegisteredConfig(SearchConfig):
         known = self.start is not None and "instance" in self.supervision
         if self.teach == "hinges" and not (known and self.camera == "known"):
             raise ValueError("teach: expected start, supervision instance and a known camera")
+
+
+def decided(config: RegisteredConfig, category: Category) -> RegisteredConfig:
+    """The configuration with what it leaves open decided for the joints of a category."""
+    stand, price = config.stand, config.dissent
+    if stand == "auto":
+        slides = any(joint.kind == "prismatic" for joint in category.joints)
+        stand = "objects" if slides and "instance" in config.supervision else "views"
+    if price is None and stand == "objects":
+        price = OBJECTS_DISSENT
+    return replace(config, stand=stand, dissent=price)
 
 
 def cpu_config() -> RegisteredConfig:

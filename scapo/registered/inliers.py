@@ -40,7 +40,7 @@ from scapo.registered.views import PartialViews
 
 VOTE = 30.0  # How sharply the losses of a view's hypotheses share its vote
 AGREES = 25.0  # Degrees from the object's frame within which a hypothesis agrees with it
-OF_ALL, NEAR = 7.0, 45.0
+OF_ALL, NEAR = 31.0, 45.0
 """How much more a vote counts that is within so many degrees of what most views of all say."""
 MORE = 0.3  # Share of the views that agree with others of their object, beyond that of bare views
 LEAST_SPREAD = 0.7  # Variance of an object's cameras against single views' with which it is asked

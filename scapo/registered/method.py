@@ -36,7 +36,7 @@ from scapo.geometry.points import Similarity, normalise
 from scapo.method import ParameterGroup, Stage, Step, changes
 from scapo.records import cat
 from scapo.registered.base import FIRST, LATE, PLACING, AbstractRegistered
-from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig
+from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
 from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
@@ -83,7 +83,7 @@ class TemplateRegistration(AbstractRegistered):
         self, config: RegisteredConfig, category: Category, generator: torch.Generator
     ) -> None:
         """A method whose template is still empty."""
-        super().__init__(config, category, generator)
+        super().__init__(decided(config, category), category, generator)
         self._frames: list[ObjectFrame] | None = None
         self.supervision: frozenset[Supervision] = frozenset(config.supervision)
 
@@ -162,7 +162,9 @@ class TemplateRegistration(AbstractRegistered):
         config = self.config
         words = [] if config.preset == "cpu" else [config.preset]
         words += ["objects known"] if self.supervision else []
-        return " ".join([*words, *changes(config, PRESETS[config.preset](), leave=UNNAMED)])
+        default = replace(PRESETS[config.preset](), supervision=config.supervision)
+        default = decided(default, self.category)
+        return " ".join([*words, *changes(config, default, leave=UNNAMED)])
 
     def _seconds(self, clouds: int) -> float:
         """Of all steps of a discovery."""

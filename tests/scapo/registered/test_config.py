@@ -7,7 +7,14 @@ from dataclasses import asdict
 
 import pytest
 
-from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
+from scapo.categories import CATEGORIES
+from scapo.registered.config import (
+    DiscoveryConfig,
+    RegisteredConfig,
+    cpu_config,
+    decided,
+    quick_config,
+)
 from scapo.registered.course import plan_of
 
 
@@ -21,6 +28,21 @@ def test_a_dense_template_that_would_never_be_built_is_refused() -> None:
         DiscoveryConfig(dense_rounds=0)
     with pytest.raises(ValueError, match=r"^rounds: expected at least 1, found 0"):
         RegisteredConfig(rounds=0)
+
+
+@pytest.mark.parametrize(
+    ("category", "told", "stand", "price"),
+    [("drawer", True, "objects", 1.0), ("drawer", False, "views", None),
+     ("oven", True, "views", None)],
+)  # fmt: skip
+def test_objects_say_how_views_stand_where_a_part_slides_and_they_are_known(
+    category: str, told: bool, stand: str, price: float | None
+) -> None:
+    config = RegisteredConfig(supervision=("instance",) if told else ())
+    found = decided(config, CATEGORIES[category])
+    assert (found.stand, found.dissent) == (stand, price)
+    asked = RegisteredConfig(supervision=config.supervision, stand="views", dissent=0.3)
+    assert decided(asked, CATEGORIES[category]) == asked
 
 
 def test_the_quick_preset_does_less_of_the_same() -> None:
