@@ -16,7 +16,7 @@ tells.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -192,17 +192,29 @@ def _fitted(
 
 @torch.no_grad()
 def refine_deviations(
-    template: ArticulatedTemplate, views: PartialViews, placement: Placement
+    template: ArticulatedTemplate,
+    views: PartialViews,
+    placement: Placement,
+    rounds: int = ROUNDS,
+    turns: int = TURNS,
 ) -> tuple[Placement, Float[Tensor, " B"]]:
     """Placements with the deviations that their views show, and their losses.
 
     Rotations are observed, then a few steps improve the rest of the placement: rounds of both.
     With a template whose axes do not deviate the steps alone.
+
+    Args:
+        template: Held.
+        views: B views.
+        placement: Of them.
+        rounds: How often. Of a view that is placed already the first tells best, with one turn;
+            more follow its noise.
+        turns: Of `observe_part_rotations`.
     """
     loss = placement.state.new_zeros(len(placement.state))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         if template.deviates():
-            observed = observe_part_rotations(template, views, placement, REACHES)
+            observed = observe_part_rotations(template, views, placement, REACHES, turns=turns)
             placement = with_deviations(template, observed, placement)
         placement, loss = refine(template, views, placement, REFINEMENT)
     return placement, loss
@@ -240,6 +252,7 @@ def observe_part_rotations(
     placement: Placement,
     reaches: tuple[float, ...],
     poses: PartPoses | None = None,
+    turns: int = TURNS,
 ) -> PartRotations:
     """Turn every hinge's part about its pivot until it lies on its points.
 
@@ -250,24 +263,21 @@ def observe_part_rotations(
         reaches: One after the other, of the Gaussian over template points whose mean a view's
             point is matched with; 0 for the nearest one.
         poses: Of the parts, where the turns start, if they are not as placed.
+        turns: Gauss-Newton steps for each reach.
     """
     poses = template.part_poses(placement) if poses is None else poses
-    return cat(
-        [
-            _observe(
-                template, take(views, index), take(placement, index), reaches, take(poses, index)
-            )
-            for index in torch.arange(len(views.points), device=views.points.device).split(CHUNK)
-        ]
-    )
+    steps = [reach for reach in reaches for _ in range(turns)]
+    rows = torch.arange(len(views.points), device=views.points.device).split(CHUNK)
+    seen = [(take(views, index), take(placement, index), take(poses, index)) for index in rows]
+    return cat([_observe(template, *one, steps) for one in seen])
 
 
 def _observe(
     template: ArticulatedTemplate,
     views: PartialViews,
     placement: Placement,
-    reaches: tuple[float, ...],
     poses: PartPoses,
+    reaches: Sequence[float],
 ) -> PartRotations:
     placed = template.place(placement, poses)
     part = template.logit.argmax(-1)
@@ -286,8 +296,7 @@ def _observe(
             source = points - pivot, normals
             target = arms, template.normals[part == j + 1]
             for reach in reaches:
-                for _ in range(TURNS):
-                    turned = _turn_onto(source, target, turned, mine, reach)
+                turned = _turn_onto(source, target, turned, mine, reach)
         straight = rotvec_to_rotmat(axes[j] * placement.state[:, j : j + 1])
         extra = rotmat_to_rotvec(straight.mT @ turned)
         turns.append(extra @ across_axis(axes[j]).T)

@@ -434,7 +434,7 @@ class AbstractRegistered(AbstractMethod):
         if self.config.settle and mode == "refine" and said is None:
             final = refine_states(self.template, seen.views, found, self._limits())
         if self.template.deviates():
-            final, _ = refine_deviations(self.template, seen.views, final)
+            final, _ = refine_deviations(self.template, seen.views, final, rounds=1, turns=1)
         if (upright := self._upright(seen.up)) is not None:
             final = upright.raised(self.template, final)
         if said is not None:

@@ -133,7 +133,7 @@ def candidates(
     rows = torch.arange(cost.numel(), device=cost.device).view_as(cost)
     if template.deviates():  # told of the best alone: it takes longer than all that was before
         row = rows.gather(1, cost.argmin(1, keepdim=True))[:, 0]
-        fine, _ = refine_deviations(template, seen.views, take(placement, row))
+        fine, _ = refine_deviations(template, seen.views, take(placement, row), rounds=1, turns=1)
         index = rows.flatten().clone()
         index[row] = cost.numel() + torch.arange(len(row), device=row.device)
         placement = take(cat([placement, fine]), index)
