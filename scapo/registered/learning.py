@@ -89,9 +89,7 @@ class SeenClouds:
 
         A logarithmic pool (Genest and Zidek, 1986): a part that the template is sure of stays.
         """
-        normals = self.normals
-        if not bool(self.inlier.all()):  # outliers have normals of their own
-            normals = surface_normals(self.points, self.points, self.views.camera)
+        normals = self.normals * self.inlier[..., None]  # an outlier goes by where it lies
         weight = nearest_weights(template, self.points, normals, placement)
         if said is None:
             return weight
