@@ -44,7 +44,7 @@ from scapo.registered.view_network import (
     placed_by_votes,
     view_losses,
 )
-from scapo.registered.views import PartialViews, surface_normals
+from scapo.registered.views import PartialViews
 
 NOISE = 0.003  # Normalised length: standard deviation of the points' noise while a network learns
 SAMPLED = 2  # Times `count` points that are drawn from a cloud, of which the farthest are learned
