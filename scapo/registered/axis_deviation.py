@@ -22,6 +22,7 @@ from functools import partial
 from itertools import product
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -43,7 +44,7 @@ from scapo.registered.deviation_model import (
     expected_deviations,
     learn_deviations,
 )
-from scapo.registered.gauge import seat_hinges
+from scapo.registered.gauge import seat_hinges, tells_frame
 from scapo.registered.gauss_newton import bounded, by_turn, damped_step, point_equations
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.motion_segmentation import rebuild
@@ -74,6 +75,7 @@ LEAST_DEVIATION = 0.035
 """Standard deviation (rad) that is worth a fit: templates are not more exact."""
 RESTS, OUTWARDS = 4, 0.3
 """Rests that are tried beyond either end of the states, as far as this share of their range."""
+SQUARE = 0.94  # Cosine of the angle up to which an axis is put along a main direction
 LEAST_POINTS = 12  # Of a part, of those of a view, for its rotation to count
 CHUNK = 64  # Views that are observed at once
 LARGEST = 0.35  # Rotation (rad) that a part is posed with
@@ -178,16 +180,40 @@ def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:
 def _fitted(
     found: Candidate, rests: Float[Tensor, "J R"], options: FitOptions, generator: torch.Generator
 ) -> Candidate:
-    """Rounds of fitting a template, in place, and learning deviations."""
+    """Rounds of fitting a template, in place, squaring its axes and learning deviations."""
     template, views, placement = found.template, found.inliers.views, found.inliers.placement
     for number in range(ROUNDS):
         if number == 1:
             rebuild(template, views, placement, settled=True, generator=generator)
         placement, _ = bundle_adjust(template, views, placement, options, generator=generator)
+        square_axes(template)
         observed = observe_part_rotations(template, views, placement, REACHES)
         keep(template, learn_deviations(observed, placement.state, rests))
         placement = with_deviations(template, observed, placement)
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
+
+
+@torch.no_grad()
+def square_axes(template: ArticulatedTemplate) -> None:
+    """Put axes that deviate along the main directions of the base near them, in place.
+
+    Objects deviate to either side of their middle, which views hardly tell: a long part that swings
+    a quarter turn moves nearly alike about an axis that leans towards the middle of its swing. Each
+    part stays where it was at its rest. What deviations there are has to be learned anew.
+    """
+    if not tells_frame(template):
+        return
+    share = template.logit.softmax(-1)
+    for j, old in enumerate(template.directions()):
+        main = old.abs().argmax()
+        if template.kinds[j] != "revolute" or old[main].abs() < SQUARE:
+            continue
+        axis, rest = F.one_hot(main, 3).to(old) * old[main].sign(), template.rest[j]
+        back = rotvec_to_rotmat(-axis * rest) @ rotvec_to_rotmat(old * rest) - torch.eye(3).to(old)
+        own, arm = share[:, j + 1, None], template.points - template.pivot[j]
+        template.points.add_(own * (arm @ back.T))
+        template.normals.copy_(F.normalize(template.normals + own * (template.normals @ back.T)))
+        template.axis[j] = axis
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ import roma
 import torch
 from torch.testing import assert_close
 
+from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import take
 from scapo.registered import axis_deviation
 from scapo.registered.axis_deviation import (
@@ -19,6 +20,7 @@ from scapo.registered.axis_deviation import (
     refine_deviations,
     rotated_poses,
     spread_across,
+    square_axes,
     with_axis_deviation,
 )
 from scapo.registered.bundle_adjustment import Candidate, FitOptions, Inliers
@@ -126,3 +128,29 @@ def test_axes_that_do_not_deviate_make_no_template() -> None:
     views, truth = sighted(24, seed=9)
     start = Candidate(template=template(), inliers=Inliers(views=views, placement=truth))
     assert not deviating_templates(start, FitOptions(steps=5), generator(0))
+
+
+@torch.no_grad()
+def test_axes_are_put_along_the_frame_and_parts_stay_as_they_were_at_rest() -> None:
+    made, rest = template(), torch.tensor([0.4])
+    lean = rotvec_to_rotmat(torch.tensor([0.0, 0.0, 0.15]))
+    made.axis.copy_((lean @ made.axis.T).T)
+    made.rest.copy_(rest)
+    made.logit.mul_(10)  # parts without a seam
+    placement = replace(
+        sighted(1, seed=2)[1],
+        state=rest[None],
+        shift=torch.zeros(1, 1, 3),
+        log_scale=torch.zeros(1, 3),
+    )
+    before = made.place(placement)
+    square_axes(made)
+    assert torch.equal(made.axis, torch.eye(3)[1:2])
+    after = made.place(placement)
+    for old, new in zip(before, after, strict=True):
+        assert_close(new, old, atol=1e-5, rtol=0)
+    flap = template()
+    assert (made.points - flap.points).norm(dim=-1).max() > 0.01  # at state 0 the flap is elsewhere
+    made.axis.copy_(torch.tensor([[0.0, 0.8, 0.6]]))  # between two directions: which one?
+    square_axes(made)
+    assert_close(made.axis, torch.tensor([[0.0, 0.8, 0.6]]))
