@@ -10,7 +10,7 @@ of a search (`refit`), at last with more points (`densified`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -189,6 +189,8 @@ def densified(
         if config.way_out and number == 0:
             placement = choose_axes(dense, placement, torch.eye(3))
         options = late_options(dense, config)
+        if bool(dense.alike):  # the main directions of one half are not those of the two
+            options = replace(options, axis_weight=0.0)
         placement, _ = bundle_adjust(dense, views, placement, options, generator=generator)
     placement = settle_hinges(dense, placement, touching=True)
     return Candidate(template=dense, inliers=Inliers(views=views, placement=placement))
