@@ -9,15 +9,18 @@ import pytest
 import torch
 
 from scapo.geometry.rigid import axis_angle, point_line_distance
+from scapo.registered import bundle_adjustment
 from scapo.registered.bundle_adjustment import (
     Candidate,
     FitOptions,
     Inliers,
     bundle_adjust,
+    densified,
     refit,
     wide_states,
 )
 from scapo.registered.config import DiscoveryConfig
+from scapo.registered.template import Placement
 from tests.helpers.sighted import AXIS, PIVOT, sighted, template
 from tests.helpers.sliding import OUT, UP, cabinet, placements, seen
 from tests.helpers.strategies import generator
@@ -48,6 +51,24 @@ def test_a_sliding_joint_along_a_wrong_axis_is_put_right(count: int, rounds: int
     assert axis_angle(wrong.directions()[0].detach(), OUT).rad2deg() < 10
     opened = torch.stack([found.placement.state[:, 0], truth.shift[:, 0] @ OUT])
     assert torch.corrcoef(opened)[0, 1].abs() > 0.9
+
+
+@pytest.mark.parametrize("alike", [False, True])
+def test_the_hinge_of_two_like_halves_is_not_pulled_to_the_frame_of_one(
+    alike: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, truth = sighted(4, seed=12)
+    shape, pulls = template(), list[float]()
+    shape.alike.fill_(float(alike))
+
+    def fitted(_: object, __: object, placement: Placement, options: FitOptions, **___: object):
+        pulls.append(options.axis_weight)
+        return placement, torch.zeros(4)
+
+    monkeypatch.setattr(bundle_adjustment, "bundle_adjust", fitted)
+    start = Candidate(template=shape, inliers=Inliers(views=views, placement=truth))
+    densified(start, DiscoveryConfig(final_points=400), generator(0))
+    assert pulls == [0.0 if alike else DiscoveryConfig().axis_weight]
 
 
 def test_ranges_before_anything_is_known():
