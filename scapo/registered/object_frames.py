@@ -15,7 +15,7 @@ import logging
 
 import torch
 
-from scapo.registered.inliers import LEAST_SPREAD, OwnedViews
+from scapo.registered.inliers import SPREADS, OwnedViews
 from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pose_search import Hypotheses
 from scapo.registered.synchronisation import densest
@@ -39,7 +39,7 @@ def taught_by_objects(
     alone = hypotheses.best_rotation()
     spread = asked.spread(alone)
     logger.info("cameras of objects spread %.2f as widely as those of single views", spread)
-    if spread < LEAST_SPREAD:
+    if not SPREADS[0] <= spread <= SPREADS[1]:
         return None
     common = asked.rotation.mT @ alone  # common_R_template, by each view
     frame = densest(common, torch.ones(len(common)))[0]

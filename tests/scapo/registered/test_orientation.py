@@ -187,17 +187,18 @@ def test_objects_teach_what_the_loss_mistakes(monkeypatch: pytest.MonkeyPatch) -
     assert right(scorer, others, truth) > 0.85 > right(by_loss, others, truth) + 0.1
 
 
-@pytest.mark.parametrize("gathered", [False, True])
-def test_objects_whose_cameras_gather_do_not_teach(
-    gathered: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("cameras", ["right", "gathered", "scattered"])
+def test_objects_whose_cameras_gather_or_scatter_do_not_teach(
+    cameras: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Views of all sides were registered as if they showed one."""
+    """Views of all sides were registered as if they showed one, or one for the other."""
     turns = random_rotations(COUNT, generator(7))
     objects, rotation = objects_of_chairs(turns)
-    if gathered:
-        objects = [replace(one, posed=replace(one.posed, rotation=facing(one))) for one in objects]
+    posed = {"right": lambda one: one.posed.rotation, "gathered": facing,
+             "scattered": lambda _: random_rotations(EACH, generator(9))}[cameras]  # fmt: skip
+    objects = [replace(one, posed=replace(one.posed, rotation=posed(one))) for one in objects]
     told = taught(objects, turns, rotation, monkeypatch)
-    assert (told is None) == gathered
+    assert (told is None) == (cameras != "right")
 
 
 def facing(one: OneObject) -> Tensor:
