@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from scapo.geometry.points import gather
+from scapo.geometry.rigid import rotation_between
 from scapo.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from scapo.method import NO_JOURNAL, Journal, own_generators
 from scapo.records import cat, take
@@ -180,16 +181,17 @@ def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:
 def _fitted(
     found: Candidate, rests: Float[Tensor, "J R"], options: FitOptions, generator: torch.Generator
 ) -> Candidate:
-    """Rounds of fitting a template, in place, squaring its axes and learning deviations."""
+    """Rounds of fitting a template, in place, and learning deviations; then axes are squared."""
     template, views, placement = found.template, found.inliers.views, found.inliers.placement
     for number in range(ROUNDS):
         if number == 1:
             rebuild(template, views, placement, settled=True, generator=generator)
         placement, _ = bundle_adjust(template, views, placement, options, generator=generator)
-        square_axes(template)
         observed = observe_part_rotations(template, views, placement, REACHES)
         keep(template, learn_deviations(observed, placement.state, rests))
         placement = with_deviations(template, observed, placement)
+    square_axes(template)
+    placement, _ = refine_deviations(template, views, placement, rounds=1, turns=1)
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 
@@ -199,21 +201,25 @@ def square_axes(template: ArticulatedTemplate) -> None:
 
     Objects deviate to either side of their middle, which views hardly tell: a long part that swings
     a quarter turn moves nearly alike about an axis that leans towards the middle of its swing. Each
-    part stays where it was at its rest. What deviations there are has to be learned anew.
+    part stays where it was at its rest, and deviations what they were against the axis.
     """
-    if not tells_frame(template):
+    if not (template.deviates() and tells_frame(template)):
         return
-    share = template.logit.softmax(-1)
+    share, turns = template.logit.softmax(-1), list[Tensor]()
     for j, old in enumerate(template.directions()):
         main = old.abs().argmax()
-        if template.kinds[j] != "revolute" or old[main].abs() < SQUARE:
-            continue
-        axis, rest = F.one_hot(main, 3).to(old) * old[main].sign(), template.rest[j]
+        near = template.kinds[j] == "revolute" and bool(old[main].abs() >= SQUARE)
+        axis = F.one_hot(main, 3).to(old) * old[main].sign() if near else old
+        turns.append(across_axis(axis) @ rotation_between(old, axis) @ across_axis(old).T)
+        rest = template.rest[j]
         back = rotvec_to_rotmat(-axis * rest) @ rotvec_to_rotmat(old * rest) - torch.eye(3).to(old)
         own, arm = share[:, j + 1, None], template.points - template.pivot[j]
         template.points.add_(own * (arm @ back.T))
         template.normals.copy_(F.normalize(template.normals + own * (template.normals @ back.T)))
         template.axis[j] = axis
+    turn = torch.block_diag(*turns)
+    template.load.copy_(turn @ template.load)
+    template.noise.copy_(turn @ template.noise @ turn.T)
 
 
 @torch.no_grad()

@@ -35,6 +35,7 @@ from scapo.categories import Category
 from scapo.geometry.points import Similarity, normalise
 from scapo.method import ParameterGroup, Stage, Step, changes
 from scapo.records import cat
+from scapo.registered.axis_deviation import square_axes
 from scapo.registered.base import FIRST, LATE, PLACING, AbstractRegistered
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
 from scapo.registered.course import plan_of
@@ -113,6 +114,7 @@ class TemplateRegistration(AbstractRegistered):
             )
         for name in ("template", "pseudo", "orientation"):
             getattr(self, name).load_state_dict(getattr(known, name).state_dict())
+        square_axes(self.template)
         sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
         if self.config.teach == "hinges" and (sizes[0] != sizes[1] or not known._has_learned()):
             raise ValueError(

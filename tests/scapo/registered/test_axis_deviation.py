@@ -26,6 +26,7 @@ from scapo.registered.axis_deviation import (
 from scapo.registered.bundle_adjustment import Candidate, FitOptions, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.pose_search import SearchResult
+from scapo.registered.template import across_axis
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
@@ -136,6 +137,8 @@ def test_axes_are_put_along_the_frame_and_parts_stay_as_they_were_at_rest() -> N
     lean = rotvec_to_rotmat(torch.tensor([0.0, 0.0, 0.15]))
     made.axis.copy_((lean @ made.axis.T).T)
     made.rest.copy_(rest)
+    aside = torch.tensor([[[0.0, 0.0, 0.2]]])  # across both axes
+    made.load.copy_((across_axis(made.directions()[0]) @ aside[0, 0]).flatten())
     made.logit.mul_(10)  # parts without a seam
     placement = replace(
         sighted(1, seed=2)[1],
@@ -149,6 +152,7 @@ def test_axes_are_put_along_the_frame_and_parts_stay_as_they_were_at_rest() -> N
     after = made.place(placement)
     for old, new in zip(before, after, strict=True):
         assert_close(new, old, atol=1e-5, rtol=0)
+    assert_close(spread_across(made.load[None, None], made), aside, atol=1e-5, rtol=0)
     flap = template()
     assert (made.points - flap.points).norm(dim=-1).max() > 0.01  # at state 0 the flap is elsewhere
     made.axis.copy_(torch.tensor([[0.0, 0.8, 0.6]]))  # between two directions: which one?
