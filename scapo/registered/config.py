@@ -190,8 +190,8 @@ def decided(config: RegisteredConfig, category: Category) -> RegisteredConfig:
     if stand == "auto":
         slides = any(joint.kind == "prismatic" for joint in category.joints)
         stand = "objects" if slides and "instance" in config.supervision else "views"
-    if price is None and stand == "objects":
-        price = OBJECTS_DISSENT
+    if price is None:
+        price = OBJECTS_DISSENT if stand == "objects" else DISSENT
     return replace(config, stand=stand, dissent=price)
 
 

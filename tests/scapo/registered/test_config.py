@@ -32,11 +32,11 @@ def test_a_dense_template_that_would_never_be_built_is_refused() -> None:
 
 @pytest.mark.parametrize(
     ("category", "told", "stand", "price"),
-    [("drawer", True, "objects", 1.0), ("drawer", False, "views", None),
-     ("oven", True, "views", None)],
+    [("drawer", True, "objects", 1.0), ("drawer", False, "views", 0.2),
+     ("oven", True, "views", 0.2)],
 )  # fmt: skip
 def test_objects_say_how_views_stand_where_a_part_slides_and_they_are_known(
-    category: str, told: bool, stand: str, price: float | None
+    category: str, told: bool, stand: str, price: float
 ) -> None:
     config = RegisteredConfig(supervision=("instance",) if told else ())
     found = decided(config, CATEGORIES[category])
