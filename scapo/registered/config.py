@@ -88,6 +88,9 @@ class DiscoveryConfig(TemplateConfig):
     """Try whether the axes of hinges deviate from one object to the next."""
     template_points: int = 400
     """Points of the template while it is sought."""
+    together: bool = True
+    """Count what the views of all known objects say among the votes of each; where a symmetry
+    exchanges parts objects are read in two ways, and each votes alone."""
 
     def __post_init__(self) -> None:
         """Raise ValueError where the dense template would never be built, or the grid is coarse."""
@@ -192,7 +195,9 @@ def decided(config: RegisteredConfig, category: Category) -> RegisteredConfig:
         stand = "objects" if slides and "instance" in config.supervision else "views"
     if price is None:
         price = OBJECTS_DISSENT if stand == "objects" else DISSENT
-    return replace(config, stand=stand, dissent=price)
+    together = config.discovery.together and category.symmetry is None
+    discovery = replace(config.discovery, together=together)
+    return replace(config, stand=stand, dissent=price, discovery=discovery)
 
 
 def cpu_config() -> RegisteredConfig:

@@ -79,9 +79,15 @@ Searched = PartialViews | OwnedViews
 
 
 def voted(
-    hypotheses: Hypotheses, limits: JointLimits, searched: OwnedViews
+    hypotheses: Hypotheses, limits: JointLimits, searched: OwnedViews, *, together: bool
 ) -> tuple[SearchResult, Bool[Tensor, " B"]]:
-    """Of each view the hypothesis that its object's views vote for, what all views say counted in.
+    """Of each view the hypothesis that its object's views vote for.
+
+    Args:
+        hypotheses: Of the views.
+        limits: Of states.
+        searched: The views.
+        together: Whether what the views of all objects say is counted in.
 
     Returns:
         The placements, and whether a view has a hypothesis that agrees at all.
@@ -91,7 +97,7 @@ def voted(
     loss = hypotheses.loss + limits.penalty(state)
     frames = hypotheses.rotation().mT @ searched.rotation[:, None]  # template_R_common
     vote = torch.softmax(-VOTE * (loss + hypotheses.unlike), 1)
-    if SPREADS[0] <= searched.spread(hypotheses.best_rotation()) <= SPREADS[1]:
+    if together and SPREADS[0] <= searched.spread(hypotheses.best_rotation()) <= SPREADS[1]:
         common, _ = densest(frames.flatten(0, 1), vote.flatten())
         vote = vote * (1 + OF_ALL * within((frames * common).sum((-1, -2)), NEAR))
     trace = torch.zeros_like(loss)  # With its object's frame
@@ -127,7 +133,7 @@ def find_inliers(
     hypotheses = search_near(candidate, views, anywhere=anywhere, journal=journal)
     found, limits = within_limits(candidate, hypotheses, config)
     if isinstance(searched, OwnedViews):
-        found, agrees = voted(hypotheses, limits, searched)
+        found, agrees = voted(hypotheses, limits, searched, together=config.together)
         rows = agrees.nonzero()[:, 0]
         found, views, share = take(found, rows), take(views, rows), min(1.0, share + MORE)
     kept = most_confident(found, share)

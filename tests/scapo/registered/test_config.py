@@ -45,6 +45,12 @@ def test_objects_say_how_views_stand_where_a_part_slides_and_they_are_known(
     assert decided(asked, CATEGORIES[category]) == asked
 
 
+@pytest.mark.parametrize("category", ["oven", "laptop"])
+def test_objects_vote_together_where_no_symmetry_exchanges_their_parts(category: str) -> None:
+    found = decided(RegisteredConfig(), CATEGORIES[category])
+    assert found.discovery.together == (category == "oven")
+
+
 def test_the_quick_preset_does_less_of_the_same() -> None:
     quick, usual = quick_config(), cpu_config()
     for few, many in (

@@ -144,27 +144,40 @@ def turned_views(variance: float) -> tuple[OwnedViews, Hypotheses, torch.Tensor]
     return shown, Hypotheses(placement=placement, loss=loss, unlike=torch.zeros(10, 4)), true
 
 
-@pytest.mark.parametrize("gathered", [False, True])
-def test_views_of_all_objects_outvote_turns_that_one_object_prefers(gathered: bool) -> None:
-    """Unless the objects' cameras gather: then the views of each object vote alone."""
-    shown, hypotheses, true = turned_views(variance=0.0 if gathered else 9.0)
+def spread_as(wanted: float) -> tuple[OwnedViews, Hypotheses, torch.Tensor]:
+    """Those whose cameras spread so widely beside single views'."""
+    shown, hypotheses, _ = turned_views(variance=1.0)
+    return turned_views(variance=wanted / shown.spread(hypotheses.best_rotation()))
+
+
+@pytest.mark.parametrize(
+    ("spread", "together", "outvoted"),
+    [(1.0, True, True), (0.6, True, False), (1.3, True, False), (1.0, False, False)],
+    ids=["together", "gathered", "scattered", "exchanged"],
+)
+def test_views_of_all_objects_outvote_turns_that_one_object_prefers(
+    spread: float, together: bool, outvoted: bool
+) -> None:
+    """Unless the objects' cameras gather or scatter, or parts may be exchanged."""
+    shown, hypotheses, true = spread_as(spread)
     limits = limits_of(torch.linspace(-1, 1, 10)[:, None], ("revolute",))
     alone = hypotheses.best(limits).placement.rotation
     assert torch.equal(alone, hypotheses.best_rotation())
     assert int((rotation_angle(alone, true) > 0.1).sum()) == 4
-    found, agrees = voted(hypotheses, limits, shown)
+    found, agrees = voted(hypotheses, limits, shown, together=together)
     assert agrees.all()
     wrong = rotation_angle(found.placement.rotation, true) > 1e-3
-    assert wrong.tolist() == [False] * 5 + [gathered] * 5
+    assert wrong.tolist() == [False] * 5 + [not outvoted] * 5
 
 
 def test_a_view_none_of_whose_hypotheses_is_right_does_not_agree() -> None:
-    shown, hypotheses, _ = turned_views(variance=9.0)
+    shown, hypotheses, _ = spread_as(1.0)
     limits = limits_of(torch.linspace(-1, 1, 10)[:, None], ("revolute",))
     rotation = hypotheses.rotation().clone()
     rotation[3] = random_rotations(4, generator(5))
     placement = replace(hypotheses.placement, rotation=rotation.flatten(0, 1))
-    agrees = voted(replace(hypotheses, placement=placement), limits, shown)[1]
+    turned = replace(hypotheses, placement=placement)
+    agrees = voted(turned, limits, shown, together=True)[1]
     assert agrees.tolist() == [True] * 3 + [False] + [True] * 6
 
 
