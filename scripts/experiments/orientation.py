@@ -72,7 +72,7 @@ def by_objects(
     method: TemplateRegistration, data: Path, category: str, space: SearchSpace
 ) -> OrientationScorer:
     """What objects of the training split teach, however their cameras lie."""
-    object_frames.LEAST_SPREAD = 0.0
+    object_frames.SPREADS = 0.0, torch.inf
     dataset, config = store.dataset(data, category, "train"), method.config.discovery
     kinds, generator = method.template.kinds, torch.Generator().manual_seed(1)
     instance = torch.tensor([int(dataset[k]["instance"]) for k in range(len(dataset))])
