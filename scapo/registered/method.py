@@ -114,7 +114,8 @@ class TemplateRegistration(AbstractRegistered):
             )
         for name in ("template", "pseudo", "orientation"):
             getattr(self, name).load_state_dict(getattr(known, name).state_dict())
-        square_axes(self.template)
+        if self.config.teach == "all":  # the network learns how parts lie then
+            square_axes(self.template)
         sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
         if self.config.teach == "hinges" and (sizes[0] != sizes[1] or not known._has_learned()):
             raise ValueError(
