@@ -26,6 +26,8 @@ class Timing:
     samples_per_second: dict[str, float]
     """Of each stage, its last epoch."""
     stage_seconds: dict[str, float]
+    memory: int = 0
+    """Bytes of the process at its peak; 0 where that is not known."""
 
 
 def read_timing(run: Path) -> Timing:

@@ -177,8 +177,10 @@ def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -
 
 
 def timing(run: Path) -> dict[str, Any]:
-    """Seconds of training, where the run folder is at hand."""
+    """Seconds of training and memory at its peak (1e9 bytes), where the run folder is at hand."""
     folder = run if run.is_dir() else run.parent
     if not (folder / TIMING).is_file():
         return {}
-    return {"training_seconds": round(read_timing(folder).seconds, 1)}
+    told = read_timing(folder)
+    memory = {"training_gigabytes": round(told.memory / 1e9, 2)} if told.memory else {}
+    return {"training_seconds": round(told.seconds, 1), **memory}

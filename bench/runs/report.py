@@ -114,7 +114,7 @@ def arithmetic(training: Mapping[str, Any]) -> str:
 
 
 def stages_table(timing: Timing, rows: Iterable[Mapping[str, Any]]) -> str:
-    """Seconds and samples per second of each stage."""
+    """Seconds and samples per second of each stage; memory at the peak."""
     steps: dict[str, int] = {}
     for row in rows:
         steps[row["stage"]] = row["step"]
@@ -126,6 +126,8 @@ def stages_table(timing: Timing, rows: Iterable[Mapping[str, Any]]) -> str:
         lines.append([name or "fit", last - before, f"{seconds:.1f}", shown])
         before = last
     lines.append(["all", before, f"{timing.seconds:.1f}", ""])
+    if timing.memory:
+        lines.append(["peak memory", f"{timing.memory / 1e9:.2f} GB", "", ""])
     return table(["stage", "steps", "seconds, start included", "samples/s, last epoch"], lines)
 
 

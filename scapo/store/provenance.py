@@ -5,12 +5,18 @@ from __future__ import annotations
 
 import platform
 import subprocess
+import sys
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from os import cpu_count
 from pathlib import Path
 
 import torch
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None
 
 PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -73,3 +79,15 @@ def processor(listing: Path = Path("/proc/cpuinfo")) -> str:
         lines = []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return next(iter(named), "") or platform.processor() or platform.machine()
+
+
+def peak_memory() -> int | None:
+    """Most bytes that this process had in memory, or one of those that it began and that ended.
+
+    None where the system does not tell.
+    """
+    if resource is None:
+        return None
+    who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * max(resource.getrusage(one).ru_maxrss for one in who)

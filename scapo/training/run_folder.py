@@ -59,6 +59,8 @@ class Position:
     """State of the gradient scaler of float16."""
     best: float | None = None
     """The least validation loss of this stage."""
+    memory: int = 0
+    """Bytes of the first rank at its peak; 0 where the system does not tell."""
 
     def spend(self, stage: str, seconds: float) -> None:
         """Count time."""
@@ -257,24 +259,27 @@ class RunFolder:
             optimizer: In the middle of a stage.
             finished: Whether nothing is left to do.
         """
+        position = state.position
+        position.memory = max(position.memory, provenance.peak_memory() or 0)
         arrays = checkpoint.to_arrays(self.method, NOW)
         arrays |= {} if optimizer is None else checkpoint.optimiser_arrays(optimizer)
         arrays |= {f"{BEST}{name}": checkpoint.array(value) for name, value in state.best.items()}
         arrays["generator/order"] = checkpoint.array(state.order.get_state())
         for rank, noise in enumerate(noises):
             arrays[noise_name(rank)] = checkpoint.array(noise)
-        header = self.header(state.position, finished=finished)
+        header = self.header(position, finished=finished)
         training = {
             "format": checkpoint.TRAINING_FORMAT,
-            "position": asdict(state.position),
+            "position": asdict(position),
             "optimizer": optimizer is not None,
             "header": header,
         }
         checkpoint.write_checkpoint(self.path / checkpoint.WEIGHTS, self.method, header)
         timing = {
-            "seconds": state.position.seconds,
-            "samples_per_second": state.position.rates,
-            "stage_seconds": state.position.spent,
+            "seconds": position.seconds,
+            "samples_per_second": position.rates,
+            "stage_seconds": position.spent,
+            "memory": position.memory,
         }
         write_bytes(self.path / TIMING, (json.dumps(timing, indent=1) + "\n").encode())
         write(self.path / checkpoint.TRAINING, arrays, training)

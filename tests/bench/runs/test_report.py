@@ -90,6 +90,7 @@ def test_time_per_stage_adds_up(run: Path) -> None:
     assert rows[4:7] == ["canonicalise", "6", f"{timing.stage_seconds['canonicalise']:.1f}"]
     assert rows[8:10] == ["articulate", "6"]
     assert rows[12:14] == ["all", "12"]
+    assert f"{timing.memory / 1e9:.2f} GB" in rows
 
 
 def test_supervised_runs_need_no_calibration(run: Path) -> None:

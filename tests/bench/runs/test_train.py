@@ -122,6 +122,7 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
     assert header.data_digest == split.manifest.digest
     assert header.budget["parameters"] > 1000
     assert header.budget["training_seconds"] > 0
+    assert 0.05 < header.budget["training_gigabytes"] < 100
     assert header.budget["seconds_per_cloud"] > 0
     assert (header.budget["device"], header.budget["batch"]) == ("cpu", 2)
     assert "cores" in header.budget["processor"]

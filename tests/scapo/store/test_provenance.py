@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import platform
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -72,3 +73,19 @@ def test_the_processor_is_read_where_the_system_lists_it(tmp_path: Path) -> None
     listing.write_text("processor : 0\nmodel name\t: Fast One 3 GHz\n")
     assert provenance.processor(listing) == "Fast One 3 GHz"
     assert provenance.processor(tmp_path / "none") == platform.processor() or platform.machine()
+
+
+def test_peak_memory_counts_what_was_freed_and_the_processes_that_ended() -> None:
+    told = "import sys; from scapo.store.provenance import peak_memory as p\n"
+    bare, own, child = (
+        int(subprocess.run([sys.executable, "-c", told + code + "print(p())"],
+                           capture_output=True, text=True, check=True).stdout)
+        for code in (
+            "",
+            "a = bytearray(b'1') * 700_000_000; del a\n",
+            "import subprocess\nsubprocess.run([sys.executable, '-c',"
+            " 'a = b\"1\" * 900_000_000'])\n",
+        )
+    )  # fmt: skip
+    assert 7e8 < own < bare + 8e8
+    assert 9e8 < child < 1e9

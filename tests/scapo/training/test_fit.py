@@ -191,6 +191,7 @@ def test_the_run_folder_says_what_was_run(whole: Path) -> None:
     assert sum(terms) == pytest.approx(lines[0]["loss"], rel=1e-5)
     timing = json.loads((whole / TIMING).read_text())
     assert timing["samples_per_second"].keys() == {"canonicalise", "articulate"}
+    assert 5e7 < timing["memory"] < 1e11  # torch alone takes more than 50 MB
 
 
 def test_every_trained_weight_moves(whole: Path) -> None:
