@@ -31,7 +31,7 @@ from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.course import JUDGES, Course, are_alike, numbered, plan_of
-from scapo.registered.halves import are_halves, in_halves, may_have_halves
+from scapo.registered.halves import are_halves, cut_by_mirror, in_halves, may_have_halves
 from scapo.registered.initialisation import common_frame, fitted_proposals
 from scapo.registered.inliers import OwnedViews, Searched, find_inliers
 from scapo.registered.joint_proposals import PosedViews
@@ -106,6 +106,9 @@ def discover(
     if config.leans and "revolute" in kinds:
         deviating = partial(with_axis_deviation, best, judges, config, generator, journal)
         best = course.step("deviating axes", deviating)
+    inliers = best.inliers
+    placement = cut_by_mirror(best.template, inliers.placement)
+    best = replace(best, inliers=replace(inliers, placement=placement))
     scorer = _how_objects_stand(best, shown, course) if shown else None
     searching = partial(search_views, best, views, scorer, journal)
     found = course.step("search of all views", searching)

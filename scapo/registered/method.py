@@ -41,6 +41,7 @@ from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
 from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
+from scapo.registered.halves import cut_by_mirror
 from scapo.registered.learning import candidates
 from scapo.registered.objects import LEAST_OBJECTS, grouped, rows_by_object
 from scapo.registered.outliers import replaced
@@ -116,6 +117,7 @@ class TemplateRegistration(AbstractRegistered):
             getattr(self, name).load_state_dict(getattr(known, name).state_dict())
         if self.config.teach == "all":  # the network learns how parts lie then
             square_axes(self.template)
+            self.pseudo.shift = cut_by_mirror(self.template, self.pseudo.placement()).shift
         sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
         if self.config.teach == "hinges" and (sizes[0] != sizes[1] or not known._has_learned()):
             raise ValueError(

@@ -19,6 +19,7 @@ from scapo.registered.halves import (
     PLANES,
     UNLIKE,
     are_halves,
+    cut_by_mirror,
     cuts,
     in_halves,
     may_have_halves,
@@ -183,3 +184,75 @@ def test_halves_are_mirror_images_and_a_door_with_a_ceiling_is_none():
 )
 def test_two_parts_with_a_hinge_may_be_halves(kinds: tuple[JointKind, ...], may: bool):
     assert may_have_halves(ArticulatedTemplate(kinds, 4)) == may
+
+
+@torch.no_grad()
+def shells(count: int, *, open_by: float, reach: float = 0.0) -> tuple[ArticulatedTemplate, Tensor]:
+    """Two shells with walls at their hinge, x = 0.25, and which half each point truly is.
+
+    The other half's wall up to `reach` from the hinge is taken for the first one's, and the hinge
+    lies there.
+    """
+    g = generator(7)
+    points, normals = box(torch.tensor([0.25, 0.15, 0.06]), count, g)
+    half = torch.rand(count, generator=g) < 0.5
+    points[:, 2] += 0.06 - 0.12 * half
+    taken = half.logical_not() | ((points[:, 0] > 0.24) & (points[:, 2] > -reach))
+    hinge = torch.tensor([0.25, 0.0, 0.0])
+    turn = rotvec_to_rotmat(torch.tensor([0.0, open_by, 0.0]))
+    points[half] = (points[half] - hinge) @ turn.T + hinge
+    normals[half] = normals[half] @ turn.T
+    made = ArticulatedTemplate(("revolute",), count)
+    made.assign(points, normals, 6.0 * F.one_hot((~taken).long(), 2))
+    made.axis.copy_(torch.tensor([[0.0, 1.0, 0.0]]))
+    end = torch.tensor([0.0, 0.0, -reach]) @ turn.T + hinge
+    made.pivot.copy_(end[None])
+    made.alike.fill_(1.0)
+    return made, half
+
+
+def test_shells_are_cut_where_they_mirror_each_other_and_motions_stay():
+    angle = torch.linspace(-0.9, 0.6, 8)[:, None]
+    for reach, swapped in ((0.07, False), (0.07, True), (0.0, False)):
+        made, half = shells(1600, open_by=-1.0, reach=reach)
+        if swapped:
+            made.logit.data = made.logit.data.flip(-1)
+        truth = (half != swapped).long()
+        before = (made.logit.argmax(-1) == truth).float().mean()
+        placement = Placement.at(torch.eye(3).expand(8, 3, 3), torch.zeros(8, 3), angle)
+        hinge = torch.tensor([0.25, 0.0, 0.0])
+        lever = torch.eye(3) - rotvec_to_rotmat(made.directions().detach() * angle)
+        still = (lever @ (hinge - made.pivot.detach()[0])[:, None])[:, None, :, 0]
+        placement = replace(placement, shift=still)  # turned about the true hinge
+        poses = made.part_poses(placement)
+        placement = cut_by_mirror(made, placement)
+        after = (made.logit.argmax(-1) == truth).float().mean()
+        assert torch.allclose(made.part_poses(placement).translation, poses.translation, atol=1e-6)
+        if reach:
+            assert before < 0.95
+            assert after > 0.98
+            assert (made.pivot.detach()[0] - hinge).norm() < 0.02
+            assert placement.shift.norm(dim=-1).max() < 0.3 * still.norm(dim=-1).max()
+        else:
+            assert after == before
+
+
+@torch.no_grad()
+def test_what_crosses_its_hinge_or_is_no_two_halves_is_not_cut():
+    points, normals, bar = bars(600, 3)
+    made = ArticulatedTemplate(("revolute",), 600)
+    made.assign(
+        *(opened(x, bar, torch.tensor(0.6)) for x in (points, normals)), 6.0 * F.one_hot(bar, 2)
+    )
+    made.axis.copy_(UP[None])
+    made.pivot.zero_()
+    made.alike.fill_(1.0)
+    door = shells(1600, open_by=-1.0, reach=0.07)[0]
+    door.alike.zero_()
+    for shape in (made, door):
+        logit, pivot = shape.logit.clone(), shape.pivot.clone()
+        state = torch.zeros(2, 1)
+        kept = Placement.at(torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3), state)
+        assert torch.equal(cut_by_mirror(shape, kept).shift, kept.shift)
+        assert torch.equal(shape.logit, logit)
+        assert torch.equal(shape.pivot, pivot)
