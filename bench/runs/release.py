@@ -47,7 +47,8 @@ CHECKS = "checks"
 FORMAT = "scapo-answers/1"
 LEGEND = (
     "Means. S: part IoU; D: direction of the joints; C: their pivots; R, t: poses of the parts. C "
-    "and t in units of 4 x the cloud's mean radius."
+    "and t in units of 4 x the cloud's mean radius. `objects known`: told in training which clouds "
+    "show the same object (`--supervision instance`)."
 )
 CAMERA = """
 It uses where the camera stands: the origin of the cloud's frame, or `sensor`."""
@@ -275,13 +276,13 @@ def scores_table(header: Header, scores: Path | None) -> str:
     if scores is None:
         return "Not given."
     rows = [
-        (*_where(report), variant or "fast", trait, _numbers(report, summary))
+        (*_where(report), report.variant or "fast", trait, f"{clouds:,}", _numbers(report, found))
         for report in _reports(header, scores)
-        for variant, trait, summary in _summaries(report)
+        for trait, clouds, found in _summaries(report)
     ]
     if not rows:
         return "None of this run."
-    heads = ["data", "split", "variant", "objects", *(metric[0] for metric in METRICS)]
+    heads = ["data", "split", "variant", "objects", "clouds", *(metric[0] for metric in METRICS)]
     lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     lines += [f"| {' | '.join(row)} |" for row in sorted(rows)]
     told = [UNCALIBRATED_NOTE] if any(UNCALIBRATED in line for line in lines) else []
@@ -305,11 +306,11 @@ def _reports(header: Header, scores: Path) -> Iterator[Report]:
             yield report
 
 
-def _summaries(report: Report) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+def _summaries(report: Report) -> Iterator[tuple[str, int, Mapping[str, Any]]]:
     whole = {name: {"mean": one.mean} for name, one in report.summary.items()}
-    yield report.variant, "all", whole
+    yield "all", len(report.instance), whole
     for trait, found in report.by_trait.items():
-        yield report.variant, trait or "as in training", found["summary"]
+        yield trait or "as in training", found["samples"], found["summary"]
 
 
 def _numbers(report: Report, summary: Mapping[str, Any]) -> str:

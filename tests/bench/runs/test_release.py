@@ -135,7 +135,7 @@ def test_the_card_tells_the_scores_of_this_run(folder: Path):
         evaluate(Request(predictions=path, data=folder / "data", out=out))
         text = card_of(header, request(folder, scores=folder / "scores"))
         assert ("None of this run." in text) == (name == "other")
-    assert "| clean | test | fast | all | 100.0 | 0.0 | 0.000 | 0.0‡ | 0.000‡ |" in text
+    assert "| clean | test | fast | all | 8 | 100.0 | 0.0 | 0.000 | 0.0‡ | 0.000‡ |" in text
     assert text.count("‡ Not calibrated: ") == 1
     assert text.count("| all |") == 1
     assert "d" * 64 in text
