@@ -45,7 +45,7 @@ from scapo.registered.deviation_model import (
     expected_deviations,
     learn_deviations,
 )
-from scapo.registered.gauge import seat_hinges, tells_frame
+from scapo.registered.gauge import seat_hinges, settle_hinges, tells_frame
 from scapo.registered.gauss_newton import bounded, by_turn, damped_step, point_equations
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.motion_segmentation import rebuild
@@ -181,7 +181,10 @@ def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:
 def _fitted(
     found: Candidate, rests: Float[Tensor, "J R"], options: FitOptions, generator: torch.Generator
 ) -> Candidate:
-    """Rounds of fitting a template, in place, and learning deviations; then axes are squared."""
+    """Rounds of fitting a template, in place, and learning deviations; then axes are squared.
+
+    Hinges go where the parts touch: while axes lean, fits leave them beside thin parts.
+    """
     template, views, placement = found.template, found.inliers.views, found.inliers.placement
     for number in range(ROUNDS):
         if number == 1:
@@ -192,6 +195,7 @@ def _fitted(
         placement = with_deviations(template, observed, placement)
     square_axes(template)
     placement, _ = refine_deviations(template, views, placement, rounds=1, turns=1)
+    placement = settle_hinges(template, placement, touching=True)
     return Candidate(template=template, inliers=Inliers(views=views, placement=placement))
 
 

@@ -41,6 +41,7 @@ from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
 from scapo.registered.course import plan_of
 from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
+from scapo.registered.gauge import settle_hinges
 from scapo.registered.halves import cut_by_mirror
 from scapo.registered.learning import candidates
 from scapo.registered.objects import LEAST_OBJECTS, grouped, rows_by_object
@@ -116,8 +117,7 @@ class TemplateRegistration(AbstractRegistered):
         for name in ("template", "pseudo", "orientation"):
             getattr(self, name).load_state_dict(getattr(known, name).state_dict())
         if self.config.teach == "all":  # the network learns how parts lie then
-            square_axes(self.template)
-            self.pseudo.shift = cut_by_mirror(self.template, self.pseudo.placement()).shift
+            self._improve_template()
         sizes = [(one.config.camera, one.config.channels) for one in (known, self)]
         if self.config.teach == "hinges" and (sizes[0] != sizes[1] or not known._has_learned()):
             raise ValueError(
@@ -127,6 +127,14 @@ class TemplateRegistration(AbstractRegistered):
         if sizes[0] == sizes[1]:
             self.network.load_state_dict(known.network.state_dict())
         self._place(observation.points, labels, generator, LATE)
+
+    def _improve_template(self) -> None:
+        """What a discovery does to its template at last and an earlier one may have left."""
+        square_axes(self.template)
+        placement = self.pseudo.placement()
+        if self.template.deviates():
+            placement = settle_hinges(self.template, placement, touching=True)
+        self.pseudo.shift = cut_by_mirror(self.template, placement).shift
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's rounds, of all of it or of what it says of hinges."""
