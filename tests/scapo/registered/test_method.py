@@ -351,3 +351,24 @@ def test_a_model_that_knows_no_camera_cannot_be_shown_whole_surfaces() -> None:
             other.network.learned.fill_(learned)
         with pytest.raises(ValueError, match="mode whole: expected a network that learned"):
             other.predict(observation, "whole")
+
+
+@torch.no_grad()
+def test_a_start_puts_hinges_whose_axes_deviate_where_the_parts_touch():
+    """Motions stay what they were; a template whose axes do not deviate was put so before."""
+    method, _ = trained(steps=0)
+    hinge, off = method.template.pivot.clone(), torch.tensor([0.0, 0.0, 0.06])
+    truth = method.pseudo.placement()
+    moved = method.template.part_poses(truth).translation
+    turn = method.template.hinged(0, truth)
+    method.template.pivot += off
+    method.pseudo.shift = truth.shift + ((turn - torch.eye(3)) @ off)[:, None]
+    assert_close(method.template.part_poses(method.pseudo.placement()).translation, moved)
+    method._improve_template()
+    assert_close(method.template.pivot, hinge + off)
+    method.template.load.fill_(0.1)
+    method._improve_template()
+    assert (method.template.pivot - hinge).norm() < 0.025
+    placed = method.template.place(method.pseudo.placement())[0]
+    first = template()
+    assert (placed - first.place(truth)[0]).norm(dim=-1).max() < 0.02
