@@ -2,13 +2,17 @@
 """The object of a depth image without a mask: the nearest thing that is neither floor nor wall.
 
 Planes that reach the image's border are taken away, then pixels are joined whose depths follow
-each other; of the pieces that are large enough the nearest is the object.
+each other. An object is several such pieces: a door before its body, a temple beside its frame. Of
+the large ones the nearest is the object's, and with it all that lies near it.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from scapo.geometry.camera import Intrinsics, back_project
 
@@ -26,6 +30,15 @@ STEP = 0.02
 """Share of the depth by which neighbouring pixels of one thing differ at most."""
 LEAST_PIECE = 0.005
 """Share of the pixels with a depth that the object has at least."""
+LARGE = 0.1
+"""Share of the largest piece's pixels that a piece has at least with which the object is begun."""
+REACH, LARGER = 1 / 3, 3.0
+"""Share of a diagonal within which another piece is the object's own: that of the object as far as
+it is found, or of the piece, if it is not more times as large."""
+LEAST_SPECK = 20
+"""Pixels of a piece at least: what has fewer is left out."""
+SAMPLE_GAP = 1000
+"""Points of a piece that distances are measured with."""
 
 
 def nearest_object(
@@ -46,17 +59,53 @@ def nearest_object(
         left, planes = left & ~plane, planes + 1
     pieces = _pieces(depth, left)
     count = np.bincount(pieces[left], minlength=1)
-    large = np.flatnonzero(count >= max(LEAST_PIECE * total, 1))
-    large = large[large > 0]
-    if not len(large):
+    count[0] = 0
+    if count.max() < max(LEAST_PIECE * total, 1):
         return depth > 0, ("no --mask: no single object found, all of the image is taken",)
+    large = np.flatnonzero(count >= max(LARGE * count.max(), LEAST_PIECE * total))
     middles = [float(np.median(depth[pieces == piece])) for piece in large]
-    chosen = pieces == large[int(np.argmin(middles))]
+    own = _with_what_is_near(
+        int(large[int(np.argmin(middles))]), pieces, np.flatnonzero(count >= LEAST_SPECK),
+        depth, camera,
+    )  # fmt: skip
+    chosen = np.isin(pieces, own)
     words = (
-        f"no --mask: {planes} plane(s) at the border left out as floor or wall, the nearest of "
-        f"{len(large)} thing(s) is taken, {int(chosen.sum()):,} of {total:,} pixels"
+        f"no --mask: {planes} plane(s) at the border left out as floor or wall, the nearest thing "
+        f"is taken, {len(own)} piece(s), {int(chosen.sum()):,} of {total:,} pixels"
     )
     return chosen, (words,)
+
+
+def _with_what_is_near(
+    first: int,
+    pieces: np.ndarray,
+    others: np.ndarray,
+    depth: Float[np.ndarray, "H W"],
+    camera: Intrinsics,
+) -> list[int]:
+    """Numbers of the pieces of an object: the first, and whatever lies near what is found."""
+    points = {
+        int(piece): back_project(depth, pieces == piece, camera) for piece in {first, *others}
+    }
+    own, new, left = [first], [first], [piece for piece in points if piece != first]
+    low, high = points[first].min(0), points[first].max(0)
+    while new:
+        tree = KDTree(np.concatenate([_some(points[piece]) for piece in own]))
+        size, new = float(np.linalg.norm(high - low)), list[int]()
+        for piece in left:
+            other = float(np.linalg.norm(np.ptp(points[piece], 0)))
+            reach = REACH * max(size, min(other, LARGER * size))
+            if tree.query(_some(points[piece]), distance_upper_bound=reach)[0].min() < reach:
+                new.append(piece)
+        own += new
+        left = [piece for piece in left if piece not in new]
+        ends = np.concatenate([np.stack([low, high]), *(points[piece] for piece in new)])
+        low, high = ends.min(0), ends.max(0)
+    return own
+
+
+def _some(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K 3"]:
+    return points[:: max(1, len(points) // SAMPLE_GAP)]
 
 
 def _dominant_plane(
@@ -88,9 +137,6 @@ def _dominant_plane(
 
 def _pieces(depth: Float[np.ndarray, "H W"], left: Bool[np.ndarray, "H W"]) -> np.ndarray:
     """A number per pixel, 0 where none is left: equal where depths follow each other."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     number = np.cumsum(left).reshape(left.shape) - 1
     edges = []
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):

@@ -52,4 +52,27 @@ def test_a_flat_thing_is_no_wall():
 def test_where_there_is_only_a_wall_all_is_taken():
     shown, (words,) = nearest_object(np.full((120, 160), 2.0), CAMERA)
     assert shown.all()
-    assert "nearest of 1 thing" in words
+    assert "1 piece(s)" in words
+
+
+def boxed(depth: np.ndarray, rows: slice, columns: slice, at: float) -> None:
+    depth[rows, columns] = np.where(
+        depth[rows, columns] > 0, np.minimum(depth[rows, columns], at), at
+    )
+
+
+@pytest.mark.parametrize("floor", [True, False])
+def test_an_object_is_taken_whole_with_its_open_door_and_what_is_apart_from_it(floor):
+    """A body 0.4 m wide, a door 0.15 m before it, a bar beside it; far behind it another thing."""
+    depth, _ = scene(floor=floor, wall=floor)
+    before = depth.copy()
+    boxed(depth, slice(10, 30), slice(120, 150), 2.6)
+    for rows, columns, at in (
+        (slice(40, 80), slice(50, 98), 1.0),
+        (slice(45, 75), slice(60, 80), 0.85),
+        (slice(40, 80), slice(101, 103), 1.0),
+    ):
+        boxed(depth, rows, columns, at)
+    wanted = (depth != before) & (depth < 2)
+    shown, _ = nearest_object(depth, CAMERA)
+    assert (shown & wanted).sum() / (shown | wanted).sum() > 0.9
