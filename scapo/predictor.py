@@ -18,6 +18,9 @@ from scapo.released import find
 from scapo.store.checkpoint import check_header
 from scapo.types import Observation, Prediction
 
+GRAIN = 1e-3
+"""Share of an object's size to which its points are told at least."""
+
 
 class Predictor:
     """A trained method, for clouds of one category.
@@ -108,6 +111,7 @@ class Predictor:
                 f"points: expected finite coordinates, found NaN or infinity in {lost:,} of "
                 f"{cloud[..., 0].numel():,} points; leave those out"
             )
+        _check_grain(cloud)
         shape = cloud.shape[:-2]
         centre = None if sensor is None else self._tensor(sensor).expand(*shape, 3).reshape(-1, 3)
         tint = None if color is None else self._tensor(color)
@@ -143,7 +147,25 @@ class Predictor:
         return way / length
 
     def _tensor(self, values: np.ndarray | Tensor) -> Tensor:
+        if not isinstance(values, Tensor):
+            values = np.asarray(values)
+            if values.dtype.kind not in "fiub":
+                raise ValueError(f"expected real numbers, found an array of {values.dtype}")
+        elif values.is_complex():
+            raise ValueError(f"expected real numbers, found a tensor of {values.dtype}")
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)
+
+
+def _check_grain(cloud: Tensor) -> None:
+    """Far from the origin single precision rounds an object's points to its own size."""
+    extent = float((cloud.amax(-2) - cloud.amin(-2)).amax(-1).amin())
+    far = float(cloud.abs().amax())
+    grain = float(np.spacing(np.float32(far)))
+    if 0 < extent < grain / GRAIN:
+        raise ValueError(
+            f"points: expected coordinates nearer to the origin, found {far:.4g} m, where single "
+            f"precision tells {grain:.2g} m apart; take one offset from points and sensor"
+        )
 
 
 def load(path_or_category: str | Path, device: str = "cpu") -> Predictor:

@@ -56,6 +56,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
         StoreError: No checkpoint, no such data, or a file of another suffix to write.
     """
     require_suffix(request.out, ".safetensors")
+    request.out.parent.mkdir(parents=True, exist_ok=True)  # fails before an hour's work, not after
     for name, count in (("limit", request.limit), ("batch", request.batch)):
         if count is not None and count < 1:
             raise ValueError(f"{name}: expected 1 or more, found {count}")

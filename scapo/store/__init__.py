@@ -56,7 +56,7 @@ __all__ = [
 def dataset(
     folder: Path | str,
     category: str | None = None,
-    split: str = "train",
+    split: str | None = None,
     names: Sequence[str] | None = None,
 ) -> SampleDataset:
     """A `torch.utils.data.Dataset` over a folder; see `scapo.store.samples.SampleDataset`.
@@ -64,7 +64,8 @@ def dataset(
     Args:
         folder: A data set, a category's or a split's folder.
         category: Needed where the folder holds several.
-        split: train, val, test or another that is there.
+        split: train, val, test or another that is there; by default that of a split's folder,
+            of any other train.
         names: Tensors of an item; None for all of the layout but `color`.
 
     Raises:

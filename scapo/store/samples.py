@@ -20,6 +20,7 @@ from torch.utils.data import Dataset
 
 from scapo.records import map_tensors, take
 from scapo.store.files import SAMPLES, Arrays, read_header, require, tensor_names
+from scapo.store.manifest import read_manifest
 from scapo.store.schema import (
     LAYOUT,
     OPTIONAL,
@@ -134,15 +135,24 @@ class SampleDataset(Dataset[dict[str, Tensor]]):
 def dataset(
     folder: Path | str,
     category: str | None = None,
-    split: str = "train",
+    split: str | None = None,
     names: Sequence[str] = TENSORS,
 ) -> SampleDataset:
     """The samples below `folder`: a data set, a category's or a split's folder.
 
+    Without a name, of the split whose folder it is, or else of train.
+
     Raises:
         StoreError: No such split, or more than one fits; a broken manifest.
     """
-    return SampleDataset(open_split(folder, category, split), names)
+    path = Path(folder)
+    if split is None:
+        split = (
+            read_manifest(path / "manifest.json").split
+            if (path / "manifest.json").is_file()
+            else "train"
+        )
+    return SampleDataset(open_split(path, category, split), names)
 
 
 def observed(split: Split) -> tuple[str, ...]:

@@ -67,7 +67,7 @@ def read(folder: Folder) -> Model:
     model = load(files)
     if model.known.set_name != "partnet-mobility":
         found = f"one of the kind {model.known.set_name!r}"
-        raise refuse(folder.path, "a PartNet-Mobility model (semantics.txt beside it)", found)
+        raise refuse(folder.path, "a PartNet-Mobility model (its root an empty link `base`)", found)
     robot = model.robot
     moving = {joint.child: joint for joint in robot.movable() if _moves(joint, repairs)}
     if not moving:

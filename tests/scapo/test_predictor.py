@@ -85,6 +85,19 @@ def test_values_that_are_not_finite_are_called_that(saved: Path) -> None:
         load(saved).predict(points)
 
 
+def test_far_from_the_origin_points_would_be_rounded(saved: Path) -> None:
+    points = plates(1, 96)[0].points.double() + 5e5
+    with pytest.raises(ValueError, match=r"nearer to the origin, found 5e\+05 m, .* 0.031 m apart"):
+        load(saved).predict(points, sensor=torch.full((3,), 5e5))
+    load(saved).predict(points - 5e5 + 100)
+
+
+@pytest.mark.parametrize("values", [np.zeros((96, 3), complex), np.full((96, 3), None)])
+def test_what_are_no_real_numbers_is_called_that(saved: Path, values: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="expected real numbers, found an array of"):
+        load(saved).predict(values)
+
+
 def test_another_mode_is_refused_with_those_there_are(saved: Path) -> None:
     words = "mode: expected one of fast, quick, refine, whole, found 'best'"
     with pytest.raises(ValueError, match=words):

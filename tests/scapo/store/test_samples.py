@@ -50,6 +50,15 @@ def same(found: dict[str, Tensor], index: int | np.ndarray) -> None:
         np.testing.assert_array_equal(found[name].numpy(), array[index], err_msg=name)
 
 
+def test_the_folder_of_a_split_is_that_split(tmp_path: Path) -> None:
+    for split, counts in (("train", (3,)), ("val", (2,))):
+        write_split(tmp_path / "laptop" / split, split=split, counts=counts)
+    assert len(store.dataset(tmp_path / "laptop" / "val")) == 2
+    assert len(store.dataset(tmp_path / "laptop")) == len(store.dataset(tmp_path)) == 3
+    with pytest.raises(StoreError, match=r"test/manifest\.json"):
+        store.dataset(tmp_path / "laptop" / "val", split="test")
+
+
 def test_items_are_the_samples_on_disk(samples: SampleDataset) -> None:
     assert len(samples) == 8
     for i in range(8):
