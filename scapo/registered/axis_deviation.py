@@ -329,7 +329,7 @@ def _observe(
         if bool(seen[-1].any()):
             pivot = (template.pivot[j] * scale)[:, None]
             arms = template.points[part == j + 1] * scale[:, None] - pivot
-            source = points - pivot, normals
+            source = points - pivot - placement.shift[:, j, None], normals
             target = arms, template.normals[part == j + 1]
             for reach in reaches:
                 turned = _turn_onto(source, target, turned, mine, reach)

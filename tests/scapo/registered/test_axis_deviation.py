@@ -33,10 +33,18 @@ from tests.helpers.strategies import generator
 ASIDE = 0.15
 
 
-def test_the_rotation_of_a_flap_whose_axis_deviates_is_observed() -> None:
+@pytest.mark.parametrize("beside", [0.0, 0.05])
+@torch.no_grad()
+def test_the_rotation_of_a_flap_whose_axis_deviates_is_observed(beside: float) -> None:
+    """Also where the objects' hinges lie beside the template's."""
     views, truth = sighted(16, seed=5, deviation=ASIDE)
     made = template()
     straight = replace(truth, deviation=torch.zeros_like(truth.deviation))
+    off = torch.tensor([0.0, 0.0, beside])
+    shift = (made.hinged(0, straight) - torch.eye(3)) @ off
+    straight = replace(straight, shift=shift[:, None])
+    truth = replace(truth, shift=((made.hinged(0, truth) - torch.eye(3)) @ off)[:, None])
+    made.pivot += off
     observed = observe_part_rotations(made, views, straight, REACHES)
     base = truth.rotation.mT
     aside, upright = (base @ made.part_poses(at).rotation[:, 1] for at in (truth, straight))
