@@ -44,7 +44,7 @@ def test_the_rotation_of_a_flap_whose_axis_deviates_is_observed(beside: float) -
     shift = (made.hinged(0, straight) - torch.eye(3)) @ off
     straight = replace(straight, shift=shift[:, None])
     truth = replace(truth, shift=((made.hinged(0, truth) - torch.eye(3)) @ off)[:, None])
-    made.pivot += off
+    made.pivot.add_(off)
     observed = observe_part_rotations(made, views, straight, REACHES)
     base = truth.rotation.mT
     aside, upright = (base @ made.part_poses(at).rotation[:, 1] for at in (truth, straight))

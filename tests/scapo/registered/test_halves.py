@@ -241,9 +241,8 @@ def test_shells_are_cut_where_they_mirror_each_other_and_motions_stay():
 def test_what_crosses_its_hinge_or_is_no_two_halves_is_not_cut():
     points, normals, bar = bars(600, 3)
     made = ArticulatedTemplate(("revolute",), 600)
-    made.assign(
-        *(opened(x, bar, torch.tensor(0.6)) for x in (points, normals)), 6.0 * F.one_hot(bar, 2)
-    )
+    points, normals = (opened(x, bar, torch.tensor(0.6)) for x in (points, normals))
+    made.assign(points, normals, 6.0 * F.one_hot(bar, 2))
     made.axis.copy_(UP[None])
     made.pivot.zero_()
     made.alike.fill_(1.0)

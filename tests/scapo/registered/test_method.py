@@ -361,7 +361,7 @@ def test_a_start_puts_hinges_whose_axes_deviate_where_the_parts_touch():
     truth = method.pseudo.placement()
     moved = method.template.part_poses(truth).translation
     turn = method.template.hinged(0, truth)
-    method.template.pivot += off
+    method.template.pivot.add_(off)
     method.pseudo.shift = truth.shift + ((turn - torch.eye(3)) @ off)[:, None]
     assert_close(method.template.part_poses(method.pseudo.placement()).translation, moved)
     method._improve_template()
