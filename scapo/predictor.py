@@ -106,12 +106,7 @@ class Predictor:
                 f"points: expected shape (..., N, 3) with N at least {least} and at least one "
                 f"cloud, found {tuple(cloud.shape)}"
             )
-        if lost := int((~torch.isfinite(cloud).all(-1)).sum()):
-            raise ValueError(
-                f"points: expected finite coordinates, found NaN or infinity in {lost:,} of "
-                f"{cloud[..., 0].numel():,} points; leave those out"
-            )
-        _check_grain(cloud)
+        _check_coordinates(cloud)
         shape = cloud.shape[:-2]
         centre = None if sensor is None else self._tensor(sensor).expand(*shape, 3).reshape(-1, 3)
         tint = None if color is None else self._tensor(color)
@@ -156,8 +151,13 @@ class Predictor:
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
 
-def _check_grain(cloud: Tensor) -> None:
-    """Far from the origin single precision rounds an object's points to its own size."""
+def _check_coordinates(cloud: Tensor) -> None:
+    """They are finite; far from the origin single precision would round them."""
+    if lost := int((~torch.isfinite(cloud).all(-1)).sum()):
+        raise ValueError(
+            f"points: expected finite coordinates, found NaN or infinity in {lost:,} of "
+            f"{cloud[..., 0].numel():,} points; leave those out"
+        )
     extent = float((cloud.amax(-2) - cloud.amin(-2)).amax(-1).amin())
     far = float(cloud.abs().amax())
     grain = float(np.spacing(np.float32(far)))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import platform
 import subprocess
 import sys
+from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from os import cpu_count
@@ -88,6 +89,14 @@ def peak_memory() -> int | None:
     """
     if resource is None:
         return None
-    who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     unit = 1 if sys.platform == "darwin" else 1024
-    return unit * max(resource.getrusage(one).ru_maxrss for one in who)
+    own, ended = (
+        unit * resource.getrusage(who).ru_maxrss
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    # Linux counts for a process what the one had that began it; for those that ended it does, too,
+    # but that is what this one had.
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        own = 1024 * int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+    return max(own, ended)

@@ -25,7 +25,7 @@ def test_the_example_runs(repository, tmp_path, category, monkeypatch):
     assert 25 <= len(code[1].splitlines()) <= 40
     assert "scapo" not in re.sub(r"scapo-predictions|\"scapo\"", "", code[1])
     (tmp_path / "halves.py").write_text(code[1])
-    made.make_data(tmp_path / "DATA", category)
+    made.make_data(tmp_path / "DATA" / "clean", category)
     monkeypatch.chdir(tmp_path)
     lines = "\n".join(commands).replace("\\\n", " ").splitlines()
     for line in (line.replace("laptop", category) for line in lines if line.strip()):
