@@ -65,12 +65,26 @@ def _add(packed: tarfile.TarFile, name: str, data: bytes) -> None:
     packed.addfile(member, io.BytesIO(data))
 
 
+def _extract(packed: tarfile.TarFile, out: Path) -> None:
+    """Plain files within `out`; anything else is refused."""
+    for member in packed.getmembers():
+        path = out / member.name
+        if not member.isfile() or out.resolve() not in path.resolve().parents:
+            raise ValueError(f"{member.name}: expected a file within the archive's folder")
+        held = packed.extractfile(member)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(held.read() if held else b"")
+
+
 def restore(archive: Path, out: Path) -> int:
     """Unpack one archive and say how many tables it held."""
     try:
         with tarfile.open(archive, "r:xz") as packed:
             names = [out / name for name in packed.getnames() if name.endswith(".csv")]
-            packed.extractall(out, filter="data")
+            if hasattr(tarfile, "data_filter"):  # not before Python 3.11.4 and 3.10.12
+                packed.extractall(out, filter="data")
+            else:
+                _extract(packed, out)
     except (EOFError, lzma.LZMAError, tarfile.TarError) as error:
         raise ValueError(f"{archive}: {error}") from error
     for lying in names:
