@@ -66,7 +66,10 @@ def _add(packed: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def _extract(packed: tarfile.TarFile, out: Path) -> None:
-    """Plain files within `out`; anything else is refused."""
+    """Plain files within `out`; anything else is refused.
+
+    `extractall(filter="data")` does so too, but not before Python 3.11.4 and 3.10.12.
+    """
     for member in packed.getmembers():
         path = out / member.name
         if not member.isfile() or out.resolve() not in path.resolve().parents:
@@ -81,10 +84,7 @@ def restore(archive: Path, out: Path) -> int:
     try:
         with tarfile.open(archive, "r:xz") as packed:
             names = [out / name for name in packed.getnames() if name.endswith(".csv")]
-            if hasattr(tarfile, "data_filter"):  # not before Python 3.11.4 and 3.10.12
-                packed.extractall(out, filter="data")
-            else:
-                _extract(packed, out)
+            _extract(packed, out)
     except (EOFError, lzma.LZMAError, tarfile.TarError) as error:
         raise ValueError(f"{archive}: {error}") from error
     for lying in names:

@@ -35,8 +35,8 @@ LARGE = 0.1
 REACH, LARGER = 1 / 3, 3.0
 """Share of a diagonal within which another piece is the object's own: that of the object as far as
 it is found, or of the piece, if it is not more times as large."""
-LEAST_SPECK = 20
-"""Pixels of a piece at least: what has fewer is left out."""
+LEAST_SPECK, MOST_PIECES = 20, 200
+"""Pixels of a piece at least, and how many pieces, the largest, are asked; others are left out."""
 SAMPLE_GAP = 1000
 """Points of a piece that distances are measured with."""
 
@@ -64,10 +64,9 @@ def nearest_object(
         return depth > 0, ("no --mask: no single object found, all of the image is taken",)
     large = np.flatnonzero(count >= max(LARGE * count.max(), LEAST_PIECE * total))
     middles = [float(np.median(depth[pieces == piece])) for piece in large]
-    own = _with_what_is_near(
-        int(large[int(np.argmin(middles))]), pieces, np.flatnonzero(count >= LEAST_SPECK),
-        depth, camera,
-    )  # fmt: skip
+    specks = int((count >= LEAST_SPECK).sum())
+    others = np.argsort(-count, kind="stable")[: min(MOST_PIECES, specks)]
+    own = _with_what_is_near(int(large[int(np.argmin(middles))]), pieces, others, depth, camera)
     chosen = np.isin(pieces, own)
     words = (
         f"no --mask: {planes} plane(s) at the border left out as floor or wall, the nearest thing "
@@ -84,9 +83,11 @@ def _with_what_is_near(
     camera: Intrinsics,
 ) -> list[int]:
     """Numbers of the pieces of an object: the first, and whatever lies near what is found."""
-    points = {
-        int(piece): back_project(depth, pieces == piece, camera) for piece in {first, *others}
-    }
+    shown = back_project(depth, pieces > 0, camera)
+    order = np.argsort(pieces[pieces > 0], kind="stable")
+    number, begin = np.unique(pieces[pieces > 0][order], return_index=True)
+    split = dict(zip(number.tolist(), np.split(shown[order], begin[1:]), strict=True))
+    points = {piece: split[piece] for piece in {first, *others.tolist()}}
     own, new, left = [first], [first], [piece for piece in points if piece != first]
     low, high = points[first].min(0), points[first].max(0)
     while new:

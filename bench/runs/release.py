@@ -48,7 +48,7 @@ FORMAT = "scapo-answers/1"
 LEGEND = (
     "Means. S: part IoU; D: direction of the joints; C: their pivots; R, t: poses of the parts. C "
     "and t in units of 4 x the cloud's mean radius. `objects known`: told in training which clouds "
-    "show the same object (`--supervision instance`)."
+    "show the same object (`--supervision instance`). `released`: this file, asked by its name."
 )
 CAMERA = """
 It uses where the camera stands: the origin of the cloud's frame, or `sensor`."""

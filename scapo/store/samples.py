@@ -145,14 +145,10 @@ def dataset(
     Raises:
         StoreError: No such split, or more than one fits; a broken manifest.
     """
-    path = Path(folder)
+    manifest = Path(folder) / "manifest.json"
     if split is None:
-        split = (
-            read_manifest(path / "manifest.json").split
-            if (path / "manifest.json").is_file()
-            else "train"
-        )
-    return SampleDataset(open_split(path, category, split), names)
+        split = read_manifest(manifest).split if manifest.is_file() else "train"
+    return SampleDataset(open_split(folder, category, split), names)
 
 
 def observed(split: Split) -> tuple[str, ...]:
