@@ -19,6 +19,7 @@ from torch import Tensor
 from scapo.categories import Category
 from scapo.geometry.matrices import rotation_error
 from scapo.geometry.part_order import joint_order
+from scapo.geometry.points import ends
 from scapo.types import Joints, Prediction
 
 RIGID = 1e-3
@@ -49,6 +50,9 @@ class Alignment:
     """+1 or -1 for each joint of the category: by what axis and state are multiplied."""
     zero: tuple[float, ...]
     """Added to the state after that: rad, or units."""
+    origin: tuple[float, float, float] | None = None
+    """Of the object's frame, from the middle of the box of each answer's own shape at rest; None:
+    where the offsets alone have it, which do not know an object's shape."""
     clouds: LabelledClouds
 
     def __post_init__(self) -> None:
@@ -70,6 +74,8 @@ class Alignment:
             raise ValueError(
                 f"sign, zero: expected {parts - 1} of each, signs 1 or -1, found {numbers}"
             )
+        if self.origin is not None and not np.isfinite(self.origin).all():
+            raise ValueError(f"origin: expected finite numbers, found {self.origin}")
 
     @staticmethod
     def of_order(order: tuple[int, ...], clouds: LabelledClouds) -> Alignment:
@@ -83,6 +89,11 @@ class Alignment:
             zero=(0.0,) * joints,
             clouds=clouds,
         )
+
+    @property
+    def numbers(self) -> int:
+        """How many were fitted; signs and the order are none."""
+        return 6 * len(self.order) + len(self.zero) + len(self.origin or ())
 
     @property
     def up(self) -> tuple[float, ...] | None:
@@ -112,6 +123,7 @@ class Alignment:
             camera_T_part=pose,
             **self._shape(found, unit),
         )
+        moved = self._centred(moved, unit)
         if found.joints is None:
             return moved
         return self._with_joints(moved, found.joints, unit, category)
@@ -139,6 +151,18 @@ class Alignment:
             state=turned * joints.state[..., index] + zero,
         )
         return replace(moved, joints=own, joint_limits=limits)
+
+    def _centred(self, moved: Prediction, unit: Float[Tensor, "*B"]) -> Prediction:
+        """With frames about the middle of the shape's box, if that is where the origin is."""
+        pose, shape = moved.camera_T_part, moved.canonical_points
+        if self.origin is None or pose is None or shape is None:
+            return moved
+        aside = torch.tensor(self.origin).to(shape) * unit.to(shape)[..., None]
+        origin = middle_of_box(shape) + aside
+        pose = pose.clone()  # of parts, whose frames are one at rest
+        pose[..., :3, 3] += (pose[..., :3, :3] @ origin[..., None, :, None].to(pose))[..., 0]
+        shape = shape - origin[..., None, :]
+        return replace(moved, camera_T_part=pose, canonical_points=shape)
 
     def _offsets(self, unit: Float[Tensor, "*B"], like: Tensor) -> Float[Tensor, "*B P 4 4"]:
         """`own_T_part` in metres."""
@@ -186,6 +210,11 @@ class ObjectFrame:
         if alignment is None:
             return None
         return ObjectFrame(**asdict(alignment.clouds), order=alignment.order)
+
+
+def middle_of_box(points: Float[Tensor, "*B M 3"]) -> Float[Tensor, "*B 3"]:
+    """Of the box of a shape, single points left out."""
+    return ends(points, -2).mean(0)
 
 
 def unit_length(points: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B"]:

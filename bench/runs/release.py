@@ -257,10 +257,9 @@ def frame_sentence(header: Header) -> str:
     """In which frame the model answers, and by which labels."""
     found = check_header(header, "header").alignment
     if found is not None:
-        numbers = 6 * len(found.order) + len(found.zero)
         return (
             "Poses are in the object's frame (z up, the front towards -x) and states 0 at rest by "
-            f"{numbers} numbers,\n  fitted after training with the labels of "
+            f"{found.numbers} numbers,\n  fitted after training with the labels of "
             f"{found.clouds.samples} clouds of `{found.clouds.split}`; no weight depends on them."
         )
     if "pose" in header["supervision"]:

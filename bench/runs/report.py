@@ -100,9 +100,8 @@ def frame_words(header: Header) -> str:
     found = check_header(header, "header").alignment
     if found is None:
         return "the method's own"
-    numbers = 6 * len(found.order) + len(found.zero)
     return (
-        f"the object's: {numbers} numbers fitted after training with the labels of "
+        f"the object's: {found.numbers} numbers fitted after training with the labels of "
         f"{found.clouds.samples} clouds of {found.clouds.split}; no weight depends on them"
     )
 

@@ -19,13 +19,15 @@ from bench.requests import Settings
 from bench.scoring.calibration import Gathered
 from bench.scoring.scores import Frames, label_of, to_arrays
 from bench.scoring.truth import Truth
-from scapo.alignment import Alignment, LabelledClouds
+from scapo.alignment import Alignment, LabelledClouds, middle_of_box
 from scapo.categories import Category
 from scapo.geometry.part_order import confusion, hard_labels
 from scapo.types import Prediction
 
 LEAST_SAMPLES = 20
 """Clouds that an alignment is fitted to."""
+CLEARER = 0.05
+"""Share of the median error of translations that a box's middle has to take away."""
 
 
 def fit_alignment(
@@ -56,12 +58,41 @@ def fit_alignment(
     if gathered.residual:
         zero = middle(np.concatenate(gathered.residual), turns)
         votes = np.concatenate(gathered.sign).sum(0)
-    return replace(
+    fixed = replace(
         named,
         own_T_part=tuple(tuple(map(tuple, one)) for one in poses.offsets.tolist()),
         sign=tuple(np.where(votes < 0, -1.0, 1.0).tolist()),
         zero=tuple(zero.tolist()),
     )
+    told = fixed.apply(found, unit, category)
+    return replace(fixed, origin=origin_of(told, np.concatenate(gathered.true), truth.scale))
+
+
+def origin_of(
+    told: Prediction, true: Float[np.ndarray, "B P 4 4"], scale: Float[np.ndarray, " B"]
+) -> tuple[float, float, float] | None:
+    """Where the object's origin is from the middle of the box of what is told of its shape.
+
+    Args:
+        told: In the object's frame.
+        true: Poses of its parts, in the same order.
+        scale: Unit of lengths of each cloud, m.
+
+    Returns:
+        None where that is told no better by the middle of a box (`CLEARER`).
+    """
+    if told.camera_T_part is None or told.canonical_points is None:
+        return None
+    pose = told.camera_T_part.numpy().astype(np.float64)
+    away = true[..., :3, 3] - pose[..., :3, 3]
+    away = (away[..., None, :] @ pose[..., :3, :3])[..., 0, :] / scale[:, None, None]
+    box = middle_of_box(told.canonical_points).numpy() / scale[:, None]
+    rest = away - box[:, None]
+    constant = np.nanmedian(rest, (0, 1))
+    before, after = (
+        np.nanmedian(np.linalg.norm(error, axis=-1)) for error in (away, rest - constant)
+    )
+    return tuple(constant.tolist()) if after < (1 - CLEARER) * before else None
 
 
 def data_order(found: Prediction, truth: Truth) -> tuple[int, ...]:

@@ -251,6 +251,8 @@ def k_means(
     return centres
 
 
+SPAN = (0.02, 0.98)
+"""Quantiles of coordinates that count as the ends of a shape."""
 MEAN_RADIUS = 0.25
 """Mean distance of the points from their centroid after `normalise`: a length of 1 is
 4 times the mean radius of that cloud."""
@@ -302,6 +304,11 @@ def normalise(points: Float[Tensor, "*B N 3"]) -> tuple[Float[Tensor, "*B N 3"],
         )
     similarity = Similarity(scale=MEAN_RADIUS / radius, centre=centre)
     return similarity.forward(points), similarity
+
+
+def ends(values: Tensor, dim: int = 0) -> Tensor:
+    """(2, ...): the ends of each coordinate along `dim`, but for single points beyond (`SPAN`)."""
+    return values.quantile(torch.tensor(SPAN).to(values), dim)
 
 
 def fibonacci_sphere(count: int) -> Float[Tensor, "{count} 3"]:

@@ -24,6 +24,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.geometry.points import ends
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
 from scapo.records import take
@@ -40,7 +41,7 @@ from scapo.registered.bundle_adjustment import (
 )
 from scapo.registered.gauge import settle_hinges
 from scapo.registered.motion_segmentation import rebuild
-from scapo.registered.template import SPAN, ArticulatedTemplate, Placement, across_axis
+from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
 from scapo.registered.views import PartialViews
 
 logger = logging.getLogger(__name__)
@@ -236,10 +237,10 @@ def cuts(template: ArticulatedTemplate) -> list[ArticulatedTemplate]:
     """
     across = across_axis(template.directions()[0])
     seen = template.points @ across.T
-    middle = seen.quantile(torch.tensor(SPAN).to(seen), 0).mean(0)
+    middle = ends(seen).mean(0)
     length = torch.linalg.svd(seen - middle, full_matrices=False).Vh
     along, aside = ((seen - middle) @ length.T).unbind(-1)
-    low, high = along.quantile(torch.tensor(SPAN).to(seen))
+    low, high = ends(along)
     made = [_cut(template, aside > 0, middle @ across)]
     for place in PLACES:
         met = low + place * (high - low)

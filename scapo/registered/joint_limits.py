@@ -17,8 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import MEAN_RADIUS
-from scapo.registered.template import SPAN, Placement
+from scapo.geometry.points import MEAN_RADIUS, ends
+from scapo.registered.template import Placement
 
 RANGE_COST = 0.03
 """Mean loss that a radian of range may save; a sliding joint pays it per mean radius (0.25)."""
@@ -68,8 +68,8 @@ def units(kinds: tuple[JointKind, ...]) -> list[float]:
 
 @torch.no_grad()
 def limits_of(state: Float[Tensor, "B J"], kinds: tuple[JointKind, ...]) -> JointLimits:
-    """The range of inliers' states, but for single outliers (`SPAN`)."""
-    low, high = state.quantile(torch.tensor(SPAN).to(state), 0)
+    """The range of inliers' states, but for single outliers (`ends`)."""
+    low, high = ends(state)
     return JointLimits(low=low, high=high, unit=state.new_tensor(units(kinds)))
 
 

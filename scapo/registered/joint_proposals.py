@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import gather, k_means
+from scapo.geometry.points import ends, gather, k_means
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import take
 from scapo.registered.motion_segmentation import OBSERVERS, gather_evidence, smooth
 from scapo.registered.pairwise import HIDDEN_COST, NearestGrid
-from scapo.registered.template import SPAN, PartPoses, across_axis
+from scapo.registered.template import PartPoses, across_axis
 from scapo.registered.views import PartialViews
 
 COUNT = 128  # Points of a view that are asked whether they moved
@@ -166,7 +166,7 @@ def _pivots(
     u, v = across_axis(direction)
     lines = []
     for side in (u, v):
-        low, high = (points @ side).quantile(torch.tensor(SPAN).to(points)).tolist()
+        low, high = ends(points @ side).tolist()
         lines.append(torch.linspace(low - BEYOND, high + BEYOND, PIVOTS).to(points))
     across = lines[0][:, None, None] * u + lines[1][None, :, None] * v
     return across.flatten(0, 1) + (centre @ direction) * direction

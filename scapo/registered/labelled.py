@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import Similarity, nearest
+from scapo.geometry.points import Similarity, ends, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.method import changes
 from scapo.records import take
@@ -36,7 +36,6 @@ from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.pose_search import SearchResult
 from scapo.registered.pseudo_labels import LearnedClouds
 from scapo.registered.template import (
-    SPAN,
     ArticulatedTemplate,
     Placement,
     slides,
@@ -189,12 +188,12 @@ def labelled_template(
 
 
 def rest_boxes(clouds: _Clouds) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B P 3"]]:
-    """Extent of each cloud's object at rest, and the middle of each of its parts (`SPAN`), m.
+    """Extent of each cloud's object at rest, and the middle of each of its parts (`ends`), m.
 
     From all clouds of the object together, in its frame at rest. A part that none shows is in the
     middle of the object.
     """
-    ends, parts = torch.tensor(SPAN), clouds.camera_T_part.shape[1]
+    parts = clouds.camera_T_part.shape[1]
     extent = clouds.points.new_zeros(len(clouds.points), 3)
     centre = clouds.points.new_zeros(len(clouds.points), parts, 3)
     for number in clouds.instance.unique():
@@ -204,10 +203,10 @@ def rest_boxes(clouds: _Clouds) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 
             apply(invert(some.camera_T_part[:, p]), some.points)[some.part == p]
             for p in range(parts)
         ]
-        low, high = torch.cat(rest).quantile(ends, 0)
+        low, high = ends(torch.cat(rest))
         extent[rows] = high - low
         for p, points in enumerate(rest):
-            centre[rows, p] = points.quantile(ends, 0).mean(0) if len(points) else 0.0
+            centre[rows, p] = ends(points).mean(0) if len(points) else 0.0
     return extent, centre
 
 

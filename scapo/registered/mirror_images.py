@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.geometry.points import ends
 from scapo.registered.bundle_adjustment import Candidate
-from scapo.registered.template import SPAN, ArticulatedTemplate, spread_out, surface_features
+from scapo.registered.template import ArticulatedTemplate, spread_out, surface_features
 
 
 @torch.no_grad()
@@ -24,7 +25,7 @@ def mirrored(template: ArticulatedTemplate, axis: int) -> ArticulatedTemplate:
 
     Args:
         template: Its parts and joints stay.
-        axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
+        axis: Of the template's frame, normal of the plane through the middle of the base (`ends`).
     """
     base = template.logit.argmax(-1) == 0
     image = _reflected(template, template.points[base], axis)
@@ -43,7 +44,7 @@ def paired(candidate: Candidate, joint: int, axis: int) -> Candidate:
     Args:
         candidate: Of two joints of one kind.
         joint: Whose part is mirrored.
-        axis: Of the template's frame, normal of the plane through the middle of the base (`SPAN`).
+        axis: Of the template's frame, normal of the plane through the middle of the base (`ends`).
     """
     template, other = candidate.template, 1 - joint
     part, swapped = template.logit.argmax(-1), [0, 2, 1]
@@ -89,5 +90,5 @@ def _reflected(
     base = template.points[template.logit.argmax(-1) == 0]
     if not len(base):
         return points
-    ends = base[:, axis].quantile(torch.tensor(SPAN).to(base)).sum()
-    return points * _across(template, axis) + ends * torch.eye(3).to(base)[axis]
+    twice = ends(base[:, axis]).sum()
+    return points * _across(template, axis) + twice * torch.eye(3).to(base)[axis]

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
+from scapo.geometry.points import ends
 from scapo.method import evenly
 from scapo.records import cat, take
 from scapo.registered.bundle_adjustment import Candidate, Inliers, first_fit
@@ -30,7 +31,7 @@ from scapo.registered.initialisation import common_frame, first_template
 from scapo.registered.inliers import OwnedViews
 from scapo.registered.joint_proposals import JointProposal, PosedViews, propose_joints
 from scapo.registered.orientation import quarter_turns
-from scapo.registered.template import SPAN, Placement
+from scapo.registered.template import Placement
 from scapo.registered.view_states import Motion, apart, motion_of
 from scapo.registered.views import TINY, PartialViews
 
@@ -64,7 +65,7 @@ class OneObject:
     """Of each joint along its best proposal."""
     centre: Float[Tensor, " 3"]
     half: Float[Tensor, " 3"]
-    """Of the box (`SPAN`) of what did not move."""
+    """Of the box (`ends`) of what did not move."""
 
     def ways(self) -> Float[Tensor, "J 3"]:
         """From the body's middle to what each joint moved, in halves of the body's box."""
@@ -205,7 +206,7 @@ def one_object(
     moved, proposals = zip(*propose_joints(posed, kinds, generator), strict=True)
     points, _ = posed.world(moved[0].shape[1])
     still = points[~torch.stack(moved).any(0)]
-    low, high = still.quantile(torch.tensor(SPAN).to(still), 0)
+    low, high = ends(still)
     motions = tuple(
         motion_of(posed, rows, found[0], kind)
         for rows, found, kind in zip(moved, proposals, kinds, strict=True)

@@ -16,12 +16,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.categories import JointKind
-from scapo.geometry.points import farthest_points
+from scapo.geometry.points import ends, farthest_points
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, take
 
-SPAN = (0.02, 0.98)
-"""Quantiles of coordinates that count as the ends of a shape: single points lie beyond it."""
 NORMAL_LENGTH = 0.06
 """Normalised length that a unit of normal difference counts as when points are told apart; the
 normals of a plate's two faces differ by 2."""
@@ -201,12 +199,11 @@ class ArticulatedTemplate(nn.Module):
 
     @torch.no_grad()
     def part_centres(self) -> Float[Tensor, "P 3"]:
-        """Middle of the box (`SPAN`) of each part's points, unscaled; of all if it has none."""
+        """Middle of the box (`ends`) of each part's points, unscaled; of all if it has none."""
         part = self.logit.argmax(-1)
-        ends = torch.tensor(SPAN).to(self.points)
         own = [self.points[part == p] for p in range(self.logit.shape[1])]
         filled = [points if len(points) else self.points for points in own]
-        return torch.stack([points.quantile(ends, 0).mean(0) for points in filled])
+        return torch.stack([ends(points).mean(0) for points in filled])
 
     def pivots(self, placement: Placement) -> Float[Tensor, "B J 3"]:
         """Of the template's joints on the base of every view, template frame, after scaling.

@@ -78,6 +78,7 @@ def test_one_cloud_or_a_grid_of_clouds_is_answered_alike() -> None:
          "expected rigid motions"),
         ({"sign": (0.5,)}, "signs 1 or -1"),
         ({"zero": ()}, "expected 1 of each"),
+        ({"origin": (0.0, float("nan"), 0.0)}, "origin: expected finite numbers"),
     ],
 )  # fmt: skip
 def test_what_is_no_alignment_is_refused(change: dict[str, Any], message: str) -> None:

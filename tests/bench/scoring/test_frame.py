@@ -74,3 +74,41 @@ def test_angles_are_taken_about_their_circular_mean() -> None:
     assert middle(angles, np.array([True]))[0] % (2 * np.pi) == pytest.approx(3.115)
     lengths = np.array([[0.1, np.nan], [0.2, np.nan], [9.0, np.nan]])
     np.testing.assert_allclose(middle(lengths, np.array([False, True])), [0.2, 0])
+
+
+def test_the_origin_is_that_of_the_whole_shape_where_parts_do_not_tell_it() -> None:
+    """Frames from the end of objects that differ in length: no constant offset has the middle."""
+    category, rng = CATEGORIES["oven"], np.random.default_rng(5)
+    own, true = convention((0, 1), rng), true_answers(category, COUNT, rng)
+    truth = truth_like(true, rng)
+    unit = torch.as_tensor(truth.scale)
+    assert true.canonical_points is not None
+    assert true.camera_T_part is not None
+    box = torch.tensor([0.1, 0.05, 0.02], dtype=torch.float64)  # of the middle, in units
+    length = torch.rand(COUNT, 1, 1, dtype=torch.float64) * unit[:, None, None]
+    line = torch.linspace(-0.5, 0.5, true.canonical_points.shape[1])[:, None].double()
+    shape = line * length * torch.tensor([1.0, 0, 0]) + (box * unit[:, None])[:, None]
+    far = shape[:, -1] - (box * unit[:, None])
+    pose = true.camera_T_part.clone()
+    pose[..., :3, 3] += (pose[..., :3, :3] @ far[:, None, :, None])[..., 0]
+    said = replace(true, camera_T_part=pose, canonical_points=shape - far[:, None])
+    answered = in_own_words(said, own, unit, category)
+    found = fit_alignment(answered, truth, CLOUDS, category)
+    assert found is not None
+    assert found.origin is not None
+    back = found.apply(answered, unit, category)
+    assert_close(back.camera_T_part, true.camera_T_part, atol=1e-3, rtol=0)
+    assert_close(back.canonical_points, shape, atol=1e-3, rtol=0)
+    without = replace(found, origin=None).apply(answered, unit, category)
+    assert without.camera_T_part is not None
+    assert (without.camera_T_part - true.camera_T_part).abs().mean() > 0.02
+
+
+def test_no_origin_of_its_own_where_offsets_have_it() -> None:
+    category, rng = CATEGORIES["oven"], np.random.default_rng(6)
+    own, true = convention((0, 1), rng), true_answers(category, COUNT, rng)
+    truth = truth_like(true, rng)
+    unit = torch.as_tensor(truth.scale)
+    found = fit_alignment(in_own_words(true, own, unit, category), truth, CLOUDS, category)
+    assert found is not None
+    assert found.origin is None
