@@ -23,9 +23,11 @@ def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     >>> rotvec_to_rotmat(torch.tensor([0.0, 0, torch.pi / 2]))[1, 0].round()
     tensor(1.)
     """
-    eye = torch.eye(3).to(vector)
-    across = torch.linalg.cross(vector[..., None, :], eye.expand(*vector.shape, 3)).mT
-    turns = vector.norm(dim=-1)[..., None, None] / torch.pi
+    x, y, z = vector.unbind(-1)
+    none = torch.zeros_like(x)
+    across = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    turns = torch.linalg.vector_norm(vector, dim=-1)[..., None, None] / torch.pi
     twice = (turns / 2).sinc().square() / 2
     return eye + turns.sinc() * across + twice * (across @ across)
 

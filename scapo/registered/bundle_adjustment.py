@@ -30,7 +30,7 @@ from scapo.registered.gauge import (
 from scapo.registered.joint_limits import limits_of
 from scapo.registered.motion_segmentation import rebuild
 from scapo.registered.pose_refinement import SCALE_WEIGHT, SHIFT_WEIGHT, SLIDE_WEIGHT, search_states
-from scapo.registered.template import ArticulatedTemplate, Placement, slides
+from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_loss import sharpened, view_loss
 from scapo.registered.views import PartialViews
 
@@ -261,7 +261,7 @@ class _Free:
         self.log_scale = start.log_scale.detach().clone().requires_grad_()
         self.state = start.state.detach().clone().requires_grad_()
         self.shift = start.shift.detach().clone().requires_grad_()
-        sliding = bool(slides(template).all())
+        sliding = bool(template.sliding.all())
         self.groups = _groups(
             (self.turn, TURN_RATE),
             (self.translation, TRANSLATION_RATE),
@@ -308,9 +308,9 @@ def _gauge(template: ArticulatedTemplate, placement: Placement, options: FitOpti
     gauge = gauge + MEAN_STATE_WEIGHT * placement.state.mean(0).square().sum()
     apart = torch.tensor([SHIFT_WEIGHT[kind] for kind in template.kinds]).to(scale)
     gauge = gauge + (placement.shift.square().sum(-1) @ apart).mean()
-    hinged = 1 - slides(template)
+    hinged = 1 - template.sliding
     gauge = gauge + MEAN_SHIFT_WEIGHT * (hinged * placement.shift.mean(0)).square().sum()
-    spread = (placement.state - placement.state.mean(0)).square() @ slides(template)
+    spread = (placement.state - placement.state.mean(0)).square() @ template.sliding
     gauge = gauge + SLIDE_WEIGHT * spread.mean()
     askew = 1 - template.directions().square().amax(-1)
     gauge = gauge + options.axis_weight * askew.sum()

@@ -13,7 +13,7 @@ from torch import Tensor
 from scapo.geometry.points import Similarity, smoothed
 from scapo.geometry.rigid import rigid
 from scapo.registered.joint_limits import JointLimits
-from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented, slides
+from scapo.registered.template import ArticulatedTemplate, PartPoses, Placement, oriented
 from scapo.types import Joints, Prediction
 
 
@@ -43,7 +43,7 @@ def placed_prediction(
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]
-    state = torch.where(slides(template)[:, 0] > 0, metric, placement.state - rest)
+    state = torch.where(template.sliding[:, 0] > 0, metric, placement.state - rest)
     shape, normals = canonical_surface(template, placement, rest)
     part = template.logit.argmax(-1)
     return Prediction(
@@ -67,7 +67,7 @@ def metric_limits(
     """Joint limits in the units and from the zero of the predicted states."""
     ends = torch.stack([limits.low, limits.high], -1)
     metric = ends / similarity.scale[:, None, None]
-    return torch.where(slides(template) > 0, metric, ends - rest[..., None])
+    return torch.where(template.sliding > 0, metric, ends - rest[..., None])
 
 
 @torch.no_grad()
@@ -88,7 +88,7 @@ def lying_rest(template: ArticulatedTemplate, placement: Placement) -> Float[Ten
         curl = torch.stack([(moment - moment.mT)[:, k - 2, k - 1] for k in range(3)], -1)
         along = (moment @ axis) @ axis
         turns.append(torch.atan2(curl @ axis, moment.diagonal(dim1=1, dim2=2).sum(1) - along))
-    return template.rest - torch.stack(turns, 1) * (1 - slides(template)[:, 0])
+    return template.rest - torch.stack(turns, 1) * (1 - template.sliding[:, 0])
 
 
 def part_frames(
@@ -113,7 +113,7 @@ def _aside(template: ArticulatedTemplate, placement: Placement) -> Float[Tensor,
     """Of the object's own hinges from where the template's are, on the base; 0 of what slides."""
     if placement.pivot is None:
         return torch.zeros_like(placement.shift)
-    return (placement.pivot - template.pivots(placement)) * (1 - slides(template))
+    return (placement.pivot - template.pivots(placement)) * (1 - template.sliding)
 
 
 @torch.no_grad()

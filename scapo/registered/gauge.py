@@ -250,7 +250,7 @@ def settle_hinges(
         if kind != "revolute":
             continue
         axis = template.directions()[j]
-        turn = template.hinged(j, placement)
+        turn = template.turns(placement)[:, j]
         lever = torch.eye(3).to(turn) - turn
         move = (lever @ (scale * template.pivot[j])[..., None])[..., 0] + shift[:, j]
         across = across_axis(axis)

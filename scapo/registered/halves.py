@@ -158,7 +158,7 @@ def _hinge_on(
     axis = template.directions()[0]
     frame = torch.cat([across_axis(axis), axis[None]])
     along = torch.linalg.cross(frame[2], normal @ frame)
-    turn, scale = template.hinged(0, placement), placement.log_scale.exp()
+    turn, scale = template.turns(placement)[:, 0], placement.log_scale.exp()
     lever = torch.eye(3).to(turn) - turn
 
     def left(step: Tensor) -> Tensor:

@@ -38,7 +38,6 @@ from scapo.registered.pseudo_labels import LearnedClouds
 from scapo.registered.template import (
     ArticulatedTemplate,
     Placement,
-    slides,
     spread_out,
     surface_features,
 )
@@ -171,7 +170,7 @@ def labelled_template(
     template = ArticulatedTemplate(kinds, count)
     extent, centre = (box[learned.index] for box in rest_boxes(clouds))
     own, scale = take(clouds, learned.index), learned.similarity.scale
-    placement = true_placements(own, extent, learned.similarity, slides(template)[:, 0])
+    placement = true_placements(own, extent, learned.similarity, template.sliding[:, 0])
     back = invert(own.camera_T_part[:, 0])
     larger = placement.log_scale.exp()[:, None]
     axis = F.normalize((own.axis @ back[:, :3, :3].mT).mean(0), dim=-1)
@@ -243,7 +242,7 @@ def _shifts(
     shift = centre[:, 1:] - larger * (centre[:, 1:] / larger).mean(0)
     axis = template.directions()
     along = (shift * axis).sum(-1, keepdim=True) * axis
-    return (shift - along) * slides(template)
+    return (shift - along) * template.sliding
 
 
 def _shared_surface(

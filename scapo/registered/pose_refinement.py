@@ -182,14 +182,12 @@ class Motion:
         poses, scale = template.part_poses(placement), placement.log_scale.exp()
         linear = poses.rotation * scale[:, None, None]  # (H, P, 3, 3)
         affine = torch.cat([linear, poses.translation[..., None]], -1).mT  # (H, P, 4, 3)
-        columns = [_base_columns(template, placement, affine)]
-        joints = range(len(template.kinds))
-        columns += [_state_column(template, placement, j, affine) for j in joints]
-        columns += [_shift_columns(template, placement, j, affine) for j in joints]
+        base = _base_columns(template, placement, affine)
+        joints = _joint_columns(template, placement, affine)
         return Motion(
             affine=affine.flatten(1, 2),
             turn=poses.rotation.mT.flatten(1, 2),
-            jacobian=torch.cat(columns, -1).flatten(1, 2),
+            jacobian=torch.cat([base, joints], -1).flatten(1, 2),
         )
 
     def place(self, skin: Skin) -> tuple[Float[Tensor, "H M 3"], Float[Tensor, "H M 3"]]:
@@ -214,31 +212,25 @@ def _base_columns(
     return torch.cat([turned, moved, scaled], -1)
 
 
-def _state_column(
-    template: ArticulatedTemplate, placement: Placement, j: int, affine: Float[Tensor, "H P 4 3"]
-) -> Float[Tensor, "H P 4 3 1"]:
-    """What the state of joint j changes."""
-    column = torch.zeros_like(affine)
-    own = template.own_directions(placement)[:, j, :, None]
-    way = (placement.rotation @ own)[..., 0]
-    if template.kinds[j] == "prismatic":
-        column[:, j + 1, 3] = way
-        return column[..., None]
-    pivot = template.pivot[j] * placement.log_scale.exp() + placement.shift[:, j]
-    arm = affine[:, j + 1].clone()
-    arm[:, 3] -= (placement.rotation @ pivot[..., None])[..., 0] + placement.translation
-    column[:, j + 1] = torch.linalg.cross(way[:, None].expand_as(arm), arm)
-    return column[..., None]
-
-
-def _shift_columns(
-    template: ArticulatedTemplate, placement: Placement, j: int, affine: Float[Tensor, "H P 4 3"]
-) -> Float[Tensor, "H P 4 3 3"]:
-    """What the place of joint j across its axis changes."""
-    axis = template.directions()[j]
-    columns = affine.new_zeros(*affine.shape, 3)
-    columns[:, j + 1, 3] = placement.rotation @ (torch.eye(3).to(axis) - axis[:, None] * axis)
-    return columns
+def _joint_columns(
+    template: ArticulatedTemplate, placement: Placement, affine: Float[Tensor, "H P 4 3"]
+) -> Float[Tensor, "H P 4 3 D"]:
+    """What the states change, and then the places of joints across their axes: each of its part."""
+    own = placement.rotation[:, None]  # (H, 1, 3, 3)
+    way = (own @ template.own_directions(placement)[..., None])[..., 0]  # (H, J, 3)
+    pivot = template.pivot * placement.log_scale.exp()[:, None] + placement.shift
+    arm = affine[:, 1:].clone()
+    arm[:, :, 3] -= (own @ pivot[..., None])[..., 0] + placement.translation[:, None]
+    turned = torch.linalg.cross(way[:, :, None].expand_as(arm), arm)
+    turned = turned * (1 - template.sliding[..., None])
+    turned[:, :, 3] += way * template.sliding
+    axis, joint = template.directions(), torch.arange(len(template.kinds), device=affine.device)
+    across = torch.eye(3).to(axis) - axis[:, :, None] * axis[:, None]  # (J, 3, 3)
+    state = affine.new_zeros(*affine.shape, len(joint))
+    state[:, joint + 1, :, :, joint] = turned.transpose(0, 1)
+    place = affine.new_zeros(*affine.shape, len(joint), 3)
+    place[:, joint + 1, 3, :, joint] = (own @ across).transpose(0, 1)
+    return torch.cat([state, place.flatten(-2)], -1)
 
 
 def _normal_equations(
@@ -301,15 +293,10 @@ def _priors(
 def _move(
     template: ArticulatedTemplate, placement: Placement, step: Float[Tensor, "H D"]
 ) -> Placement:
-    joints = len(template.kinds)
+    joints, axis = len(template.kinds), template.directions()
     turn = bounded(step[:, :3], MOST_TURN)
-    shift = placement.shift.clone()
-    axis = template.directions()
-    column = POSE + joints
-    for j in range(joints):
-        shift[:, j] += bounded(step[:, column : column + 3], MOST_MOVE)
-        shift[:, j] -= (shift[:, j] @ axis[j])[:, None] * axis[j]
-        column += 3
+    shift = placement.shift + bounded(step[:, POSE + joints :].unflatten(1, (-1, 3)), MOST_MOVE)
+    shift = shift - (shift * axis).sum(-1, keepdim=True) * axis
     return replace(
         placement,
         rotation=rotvec_to_rotmat(turn) @ placement.rotation,

@@ -27,7 +27,7 @@ from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, map_tensors, take
 from scapo.registered.pairwise import within
 from scapo.registered.synchronisation import densest
-from scapo.registered.template import ArticulatedTemplate, Placement, across_axis, slides
+from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
 from scapo.types import Observation
 
 SIDES = 24
@@ -91,7 +91,7 @@ def _said(
         said,
         translation=said.translation * size + similarity.centre,
         log_scale=said.log_scale + size.log(),
-        state=torch.where(slides(template)[:, 0] > 0, said.state * size, said.state),
+        state=torch.where(template.sliding[:, 0] > 0, said.state * size, said.state),
         shift=said.shift * size[..., None],
     )
     return placement, sure

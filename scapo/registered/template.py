@@ -84,8 +84,10 @@ class ArticulatedTemplate(nn.Module):
     """(J, 3), any length."""
     pivot: nn.Parameter
     """(J, 3)"""
+    sliding: Tensor
+    """(J, 1) 1 for each prismatic joint, 0 for the others; a buffer, as what follows."""
     normals: Tensor
-    """(M, 3); a buffer, as what follows."""
+    """(M, 3)"""
     rest: Tensor
     """(J,) state at which a deviating axis leaves the part where it is; see `axis_deviation`."""
     load: Tensor
@@ -103,6 +105,8 @@ class ArticulatedTemplate(nn.Module):
         self.logit = nn.Parameter(torch.zeros(count, len(kinds) + 1))
         self.axis = nn.Parameter(torch.ones(len(kinds), 3))
         self.pivot = nn.Parameter(torch.zeros(len(kinds), 3))
+        sliding = [[float(kind == "prismatic")] for kind in kinds]
+        self.register_buffer("sliding", torch.tensor(sliding).view(-1, 1), persistent=False)
         self.register_buffer("normals", torch.zeros(count, 3))
         self.register_buffer("rest", torch.zeros(len(kinds)))
         self.register_buffer("load", torch.zeros(2 * len(kinds)))
@@ -148,33 +152,27 @@ class ArticulatedTemplate(nn.Module):
         turn = rotvec_to_rotmat(placement.deviation)
         return (turn @ self.directions()[:, :, None])[..., 0]
 
-    def hinged(self, j: int, placement: Placement) -> Float[Tensor, "B 3 3"]:
-        """How hinge j turns its part: from its rest about its own axis (`axis_deviation`)."""
-        axis, state = self.directions()[j], placement.state[:, j : j + 1]
-        if not bool(placement.deviation[:, j].any()):
-            return rotvec_to_rotmat(axis * state)
-        aside = rotvec_to_rotmat(placement.deviation[:, j])
-        onward = rotvec_to_rotmat(axis * (state - self.rest[j]))
-        return aside @ onward @ aside.mT @ rotvec_to_rotmat(axis * self.rest[j])
+    def turns(self, placement: Placement) -> Float[Tensor, "B J 3 3"]:
+        """How joints turn their parts: not at all what slides, hinges about their own axes.
+
+        A hinge whose axis deviates turns from its rest (`axis_deviation`).
+        """
+        axis, state = self.directions(), placement.state * (1 - self.sliding[:, 0])
+        if not bool(placement.deviation.any()):
+            return rotvec_to_rotmat(axis * state[..., None])
+        onward = self.own_directions(placement) * (state - self.rest)[..., None]
+        return rotvec_to_rotmat(onward) @ rotvec_to_rotmat(axis * self.rest[:, None])
 
     def part_poses(self, placement: Placement) -> PartPoses:
         """view_T_part of every part at the placement's states (corrected bone map of Sec. 3.2)."""
-        rotations, translations = [placement.rotation], [placement.translation]
-        axis = self.directions()
-        pivot = self.pivot * placement.log_scale.exp()[:, None]
-        for j, kind in enumerate(self.kinds):
-            step = axis[j] * placement.state[:, j : j + 1]
-            if kind == "revolute":
-                turn = self.hinged(j, placement)
-                move = pivot[:, j] - (turn @ pivot[:, j, :, None])[..., 0]
-            else:
-                turn, move = torch.eye(3).to(step).expand(len(step), 3, 3), step
-            move = move + placement.shift[:, j]
-            rotations.append(placement.rotation @ turn)
-            moved = (placement.rotation @ move[..., None])[..., 0]
-            translations.append(moved + placement.translation)
+        own, turn = placement.rotation[:, None], self.turns(placement)
+        pivot = (self.pivot * placement.log_scale.exp()[:, None])[..., None]
+        slid = self.directions() * placement.state[..., None] * self.sliding
+        move = (pivot - turn @ pivot)[..., 0] + slid + placement.shift
+        translation = (own @ move[..., None])[..., 0] + placement.translation[:, None]
         return PartPoses(
-            rotation=torch.stack(rotations, 1), translation=torch.stack(translations, 1)
+            rotation=torch.cat([own, own @ turn], 1),
+            translation=torch.cat([placement.translation[:, None], translation], 1),
         )
 
     def place(
@@ -212,7 +210,7 @@ class ArticulatedTemplate(nn.Module):
         """
         pivot: Tensor = self.pivot
         if "prismatic" in self.kinds:
-            pivot = torch.where(slides(self) > 0, self.part_centres()[1:], pivot)
+            pivot = torch.where(self.sliding > 0, self.part_centres()[1:], pivot)
         return pivot * placement.log_scale.exp()[:, None] + placement.shift
 
     def joints_in_view(
@@ -221,15 +219,9 @@ class ArticulatedTemplate(nn.Module):
         """Pivots and axes in the frame of every view, the object's own where they are known."""
         pivot = self.pivots(placement)
         if placement.pivot is not None:
-            pivot = torch.where(slides(self) > 0, pivot, placement.pivot)
+            pivot = torch.where(self.sliding > 0, pivot, placement.pivot)
         pivot = pivot @ placement.rotation.mT + placement.translation[:, None]
         return pivot, self.own_directions(placement) @ placement.rotation.mT
-
-
-def slides(template: ArticulatedTemplate) -> Float[Tensor, "J 1"]:
-    """1 for each prismatic joint, 0 for the others."""
-    sliding = [[float(kind == "prismatic")] for kind in template.kinds]
-    return torch.tensor(sliding).view(-1, 1).to(template.points)
 
 
 def across_axis(axis: Float[Tensor, " 3"]) -> Float[Tensor, "2 3"]:

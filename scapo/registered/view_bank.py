@@ -24,7 +24,7 @@ from scapo.geometry.points import MEAN_RADIUS
 from scapo.geometry.rigid import rotation_between
 from scapo.records import cat, take
 from scapo.registered.pairwise import distinct, within
-from scapo.registered.template import ArticulatedTemplate, Placement, slides
+from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_loss import GRAZING
 from scapo.registered.views import FAR, TINY, PartialViews
 
@@ -107,7 +107,7 @@ class ViewBank:
             radius=radius,
             mode=mode,
             modes=modes,
-            slides=slides(template),
+            slides=template.sliding,
             front=front,
         )
 
@@ -140,7 +140,7 @@ class ViewBank:
             radius=radius[:, None],
             mode=torch.arange(len(look), device=look.device)[:, None],
             modes=placement,
-            slides=slides(template),
+            slides=template.sliding,
             front=front,
             key=shown.points[:, 0],
         )

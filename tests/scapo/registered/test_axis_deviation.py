@@ -41,9 +41,9 @@ def test_the_rotation_of_a_flap_whose_axis_deviates_is_observed(beside: float) -
     made = template()
     straight = replace(truth, deviation=torch.zeros_like(truth.deviation))
     off = torch.tensor([0.0, 0.0, beside])
-    shift = (made.hinged(0, straight) - torch.eye(3)) @ off
+    shift = (made.turns(straight)[:, 0] - torch.eye(3)) @ off
     straight = replace(straight, shift=shift[:, None])
-    truth = replace(truth, shift=((made.hinged(0, truth) - torch.eye(3)) @ off)[:, None])
+    truth = replace(truth, shift=((made.turns(truth)[:, 0] - torch.eye(3)) @ off)[:, None])
     made.pivot.add_(off)
     observed = observe_part_rotations(made, views, straight, REACHES)
     base = truth.rotation.mT

@@ -152,7 +152,7 @@ def test_a_hinge_settles_where_its_part_turns_without_shifts():
     wrong = template()
     with torch.no_grad():
         wrong.pivot.add_(aside)
-    own = (wrong.hinged(0, placement) @ (placement.log_scale.exp() * aside)[..., None])[..., 0]
+    own = (wrong.turns(placement)[:, 0] @ (placement.log_scale.exp() * aside)[..., None])[..., 0]
     shift = placement.shift[:, 0] + own - placement.log_scale.exp() * aside
     told = replace(placement, shift=(shift - (shift @ AXIS)[:, None] * AXIS)[:, None])
     found = settle_hinges(wrong, told)

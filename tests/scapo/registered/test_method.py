@@ -360,7 +360,7 @@ def test_a_start_puts_hinges_whose_axes_deviate_where_the_parts_touch():
     hinge, off = method.template.pivot.clone(), torch.tensor([0.0, 0.0, 0.06])
     truth = method.pseudo.placement()
     moved = method.template.part_poses(truth).translation
-    turn = method.template.hinged(0, truth)
+    turn = method.template.turns(truth)[:, 0]
     method.template.pivot.add_(off)
     method.pseudo.shift = truth.shift + ((turn - torch.eye(3)) @ off)[:, None]
     assert_close(method.template.part_poses(method.pseudo.placement()).translation, moved)

@@ -20,7 +20,6 @@ from scapo.registered.template import (
     Placement,
     across_axis,
     interleave,
-    slides,
     spread_out,
     surface_features,
     turn_placement,
@@ -134,7 +133,7 @@ def test_farthest_features_spread_out():
 
 def test_slides_are_marked():
     shape = ArticulatedTemplate(("revolute", "prismatic"), 5)
-    assert slides(shape).tolist() == [[0.0], [1.0]]
+    assert shape.sliding.tolist() == [[0.0], [1.0]]
 
 
 def test_a_plate_is_sampled_on_both_faces_and_parts_along_their_border():
