@@ -43,7 +43,6 @@ from scapo.registered.network import PointVotes, in_principal_frames, own_frame,
 from scapo.registered.orientation import VIEWS_CHARGE, OrientationScorer
 from scapo.registered.outliers import inlier_mask, replaced
 from scapo.registered.pose_search import (
-    ALONE,
     BRIEF,
     CHARGED,
     OWN,
@@ -54,6 +53,7 @@ from scapo.registered.pose_search import (
     SearchSpace,
     grid_of_states,
     most_confident,
+    of_one,
     refine_states,
     successive_halving,
 )
@@ -459,7 +459,7 @@ class AbstractRegistered(AbstractMethod):
             return charged.with_others(self._settled(seen, said, 0, OWN))
         alone = learned and seen.up is None  # what the network had upside down is looked for
         beside = config.quick_beside if alone else config.quick_hypotheses
-        return self._settled(seen, said, beside, BRIEF if beside else ALONE)
+        return self._settled(seen, said, beside, BRIEF if beside else of_one(self.template))
 
     def _settled(self, seen: SeenClouds, said: Said | None, beside: int, by: Effort) -> Hypotheses:
         """What is left of the network's and `beside` more, charged where it dissents."""

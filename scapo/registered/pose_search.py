@@ -389,6 +389,13 @@ def successive_halving(
     return Hypotheses(placement=placement, loss=loss.view(count, -1), unlike=unlike)
 
 
+def of_one(template: ArticulatedTemplate) -> Effort:
+    """`ALONE`; where axes deviate without its last steps, which follow what is seen of those."""
+    if not template.deviates():
+        return ALONE
+    return replace(ALONE, last=replace(ALONE.last, steps=0))
+
+
 def _states_again(
     template: ArticulatedTemplate,
     views: PartialViews,
