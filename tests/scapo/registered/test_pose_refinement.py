@@ -27,7 +27,9 @@ from tests.helpers.strategies import generator
 
 
 @pytest.mark.parametrize("aside", [0.0, 0.2])
-@pytest.mark.parametrize("kinds", [("revolute", "revolute"), ("prismatic",)])
+@pytest.mark.parametrize(
+    "kinds", [("revolute", "revolute"), ("prismatic",), ("revolute", "prismatic")]
+)
 def test_derivatives_agree_with_differences(kinds: tuple[JointKind, ...], aside: float):
     g, joints = generator(0), len(kinds)
     made = ArticulatedTemplate(kinds, 20).double()

@@ -10,6 +10,7 @@ import torch
 from scapo.geometry.rigid import rotation_angle
 from scapo.registered.joint_limits import OUTSIDE_COST, JointLimits
 from scapo.registered.pose_search import (
+    ALONE,
     THOROUGH,
     SearchResult,
     SearchSpace,
@@ -17,6 +18,7 @@ from scapo.registered.pose_search import (
     best_of,
     combinations,
     modes_of,
+    of_one,
     rank_by_confidence,
     refine_states,
     search,
@@ -96,3 +98,10 @@ def test_views_are_ordered_by_confidence():
         placement=none, loss=torch.tensor([0.4, 0.2, 0.2]), margin=torch.tensor([0.1, 0.1, 0.3])
     )
     assert rank_by_confidence(found).tolist() == [2, 1, 0]
+
+
+def test_dense_steps_are_taken_once_where_axes_deviate() -> None:
+    shape = template()
+    assert of_one(shape) == ALONE
+    shape.load.fill_(0.1)
+    assert (of_one(shape).last.steps, of_one(shape).long) == (0, ALONE.long)

@@ -48,6 +48,25 @@ def drawn(kind: JointKind) -> tuple[ArticulatedTemplate, Placement]:
     )
 
 
+@torch.no_grad()
+def test_joints_of_either_kind_move_their_own_parts_as_they_would_alone() -> None:
+    alone = [drawn("revolute"), drawn("prismatic")]
+    both = ArticulatedTemplate(("revolute", "prismatic"), 20)
+    for j, (one, _) in enumerate(alone):
+        both.axis[j], both.pivot[j] = one.axis[0], one.pivot[0]
+    placement = alone[0][1]
+    wide = replace(
+        placement,
+        **{name: torch.cat([getattr(p, name) for _, p in alone], 1)
+           for name in ("state", "shift", "deviation")},
+    )  # fmt: skip
+    poses = both.part_poses(wide)
+    for j, (one, own) in enumerate(alone):
+        told = one.part_poses(replace(placement, state=own.state, shift=own.shift))
+        assert_close(poses.rotation[:, j + 1], told.rotation[:, 1])
+        assert_close(poses.translation[:, j + 1], told.translation[:, 1])
+
+
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
 @torch.no_grad()
 def test_parts_move_as_their_joint_says(kind: JointKind):
