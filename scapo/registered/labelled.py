@@ -32,7 +32,7 @@ from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import UNNAMED, SearchConfig
 from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
-from scapo.registered.pose_refinement import BACKWARD, RANKED
+from scapo.registered.pose_refinement import RANKED, backward_weight
 from scapo.registered.pose_search import SearchResult
 from scapo.registered.pseudo_labels import LearnedClouds
 from scapo.registered.template import (
@@ -296,8 +296,8 @@ def _losses(
     template: ArticulatedTemplate, views: PartialViews, placement: Placement
 ) -> Float[Tensor, " B"]:
     """How badly the template explains each view at its placement, as hypotheses are ranked."""
-    losses = []
+    losses, weight = [], backward_weight(template)
     for index in torch.arange(len(views.points)).split(CHUNK):
         placed = template.place(take(placement, index))
-        losses.append(view_loss(take(views, index), placed, RANKED, BACKWARD))
+        losses.append(view_loss(take(views, index), placed, RANKED, weight))
     return torch.cat(losses)

@@ -55,6 +55,9 @@ LIGHT = 400  # Points of the template that the search uses until its last steps
 RANKED, BACKWARD = 250.0, 2.0
 """Sharpness of the loss that ranks hypotheses, and weight in it of the template's visible points:
 what was not seen tells wrong ones."""
+MOVED = 0.25
+"""Of that weight, for points of a part that moves: parts differ more in size than bodies do, and a
+narrow door that stands open should not count as shut because the template's is wider."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,11 +83,18 @@ def refine(
     total = views.points.shape[1]
     every = 1 if options.points >= total else 2
     some = views.thinned(torch.arange(0, total, every, device=views.points.device))
+    weight = backward_weight(template)
     losses = [
-        view_loss(take(some, index), template.place(take(placement, index)), RANKED, BACKWARD)
+        view_loss(take(some, index), template.place(take(placement, index)), RANKED, weight)
         for index in _chunks(template, views)
     ]
     return placement, torch.cat(losses) + SCALE_WEIGHT * placement.log_scale.square().sum(-1)
+
+
+def backward_weight(template: ArticulatedTemplate) -> Float[Tensor, " M"]:
+    """Of each point of the template in the loss that ranks; of two like halves neither is less."""
+    moves = template.logit.argmax(-1) > 0
+    return BACKWARD * torch.where(moves & ~template.alike.bool(), MOVED, 1.0)
 
 
 def improved(

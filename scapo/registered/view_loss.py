@@ -78,7 +78,7 @@ def view_loss(
     views: PartialViews,
     placed: tuple[Float[Tensor, "B M 3"], Float[Tensor, "B M 3"]],
     sharpness: float,
-    backward: float = 1.0,
+    backward: float | Float[Tensor, " M"] = 1.0,
 ) -> Float[Tensor, " B"]:
     """Robust distance of each view to a placed template, both ways, self-occlusion respected.
 
@@ -86,7 +86,7 @@ def view_loss(
         views: B views.
         placed: Points and normals of the template in each view.
         sharpness: k of `match_weight`.
-        backward: Weight of the template's visible points.
+        backward: Weight of the template's visible points, or of each.
     """
     points, normals = placed
     index = oriented_nearest(views.points, views.normals, points, normals)
@@ -97,4 +97,5 @@ def view_loss(
         counts = should_be_seen(views, points, normals).to(points.dtype)
         back = oriented_nearest(points, normals, views.points, views.normals)
     off = (points - gather(views.points, back)).square().sum(-1)
-    return there.mean(-1) + backward * ((1 - match_weight(off, sharpness)) * counts).mean(-1)
+    missed = backward * (1 - match_weight(off, sharpness)) * counts
+    return there.mean(-1) + missed.mean(-1)

@@ -18,7 +18,7 @@ from scapo.records import take
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, TemplateConfig
 from scapo.registered.labelled import LabelledConfig, LabelledRegistered
 from scapo.registered.method import TemplateRegistration
-from scapo.registered.pose_refinement import BACKWARD, RANKED
+from scapo.registered.pose_refinement import RANKED, backward_weight
 from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_loss import view_loss
 from scapo.registered.views import PartialViews, observe
@@ -98,7 +98,9 @@ def test_pseudo_labels_are_the_true_placements(made: LabelledRegistered) -> None
 
 def loss_of(template: ArticulatedTemplate, views: PartialViews, placement: Placement) -> float:
     with torch.no_grad():
-        return float(view_loss(views, template.place(placement), RANKED, BACKWARD).mean())
+        return float(
+            view_loss(views, template.place(placement), RANKED, backward_weight(template)).mean()
+        )
 
 
 def views_of(seen: Objects) -> PartialViews:

@@ -8,7 +8,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from scapo.registered.pose_refinement import BACKWARD, MOVED, backward_weight
 from scapo.registered.view_loss import (
     NORMAL_WEIGHT,
     match_weight,
@@ -36,6 +38,24 @@ def test_the_loss_is_least_at_the_truth():
         loss = view_loss(views, shape.place(wrong), 250.0)
         assert loss.mean() > right.mean() + 0.05
         assert (loss > right).sum() >= 3  # the flap is edge-on in one view
+
+
+@torch.no_grad()
+def test_what_is_missed_of_a_moving_part_counts_less_but_of_two_like_halves() -> None:
+    views, truth = sighted(4, seed=10)
+    shape, moves = template(), template().logit.argmax(-1) > 0
+    wrong = shape.place(replace(truth, state=truth.state + 0.8))
+    whole = view_loss(views, wrong, 250.0, BACKWARD)
+    weight = backward_weight(shape)
+    assert weight[~moves].unique().tolist() == [BACKWARD]
+    assert weight[moves].unique().tolist() == [BACKWARD * MOVED]
+    forward = view_loss(views, wrong, 250.0, 0.0)
+    body = view_loss(views, wrong, 250.0, BACKWARD * ~moves)
+    own = view_loss(views, wrong, 250.0, weight)
+    assert_close(own - forward, body - forward + MOVED * (whole - body))
+    assert (own < whole).all()
+    shape.alike.fill_(1.0)
+    assert_close(view_loss(views, wrong, 250.0, backward_weight(shape)), whole)
 
 
 def test_the_two_faces_of_a_plate_are_told_apart():
