@@ -22,12 +22,12 @@ from torch import Tensor
 import bench.__main__
 from scapo import store
 from scapo.categories import CATEGORIES, Category
+from scapo.geometry.points import ends
 from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Mode
 from scapo.paper import method as paper
 from scapo.paper.warm_start import POINTS
 from scapo.records import take
-from scapo.registered.template import SPAN
 from scapo.store.samples import read_training_data
 from scapo.types import Observation, Prediction
 
@@ -68,14 +68,14 @@ class Truth:
 
     def stretched(self, row: int) -> Float[Tensor, "M 3"]:
         """The model's points, each part in the box of the cloud's own part."""
-        rest, ends = self.at_rest(row), torch.tensor(SPAN)
+        rest = self.at_rest(row)
         part, made = self.part[self.model], self.shape[:POINTS].clone()
         for p in range(len(self.category.parts)):
             own, model = rest[self.part[row] == p], self.shape[part == p]
             if len(own) < 2:
                 continue
-            low, high = own.quantile(ends, 0)
-            first, last = model.quantile(ends, 0)
+            low, high = ends(own)
+            first, last = ends(model)
             size = ((high - low) / (last - first).clamp_min(LEAST_SIDE)).clamp(1 / STRETCH, STRETCH)
             size = torch.where(last - first < LEAST_SIDE, 1.0, size)
             placed = (self.shape[:POINTS] - (first + last) / 2) * size + (low + high) / 2
