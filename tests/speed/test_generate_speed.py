@@ -79,7 +79,7 @@ def test_many_objects_at_once(capsys: pytest.CaptureFixture[str]) -> None:
         print(f"\n{lines[0]['device']}")  # noqa: T201
         for line in lines:
             print(  # noqa: T201
-                f"{line['places']:5d} at once: {line['clouds']:.0f} clouds/s, "
+                f"{line['at once']:5d} at once: {line['clouds']:.0f} clouds/s, "
                 f"{line['pictures']:.0f} pictures/s"
             )
     assert len(lines) >= 3
