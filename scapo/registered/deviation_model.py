@@ -8,10 +8,11 @@ order by (1 - R(a, s - r)) tau, in the part's own frame by
 
     t = (R(a, -s) - R(a, -r)) tau + noise.
 
-Deviations are one number per object: tau = z load, z ~ N(0, 1), the same z for all hinges. What
-single hinges do beyond that is noise, learned in the part's own frame: of a thin part, a turn about
-its length is hardly seen. Load and noise maximise the likelihood of the rotations (a factor
-analysis); the deviation of a view is then the mean of z given its rotations.
+Deviations are one number per object: tau = z load, z ~ N(0, 1), the same z for all hinges. The load
+may have to lie in a span: hinges that are parallel stay so where all deviate alike. What single
+hinges do beyond that is noise, learned in the part's own frame: of a thin part, a turn about its
+length is hardly seen. Load and noise maximise the likelihood of the rotations (a factor analysis);
+the deviation of a view is then the mean of z given its rotations.
 
 Vectors of D = 2 J numbers are J rotations one after the other, each along the two directions of
 `across_axis`.
@@ -61,7 +62,10 @@ class DeviationModel:
 
 @torch.no_grad()
 def learn_deviations(
-    observed: PartRotations, state: Float[Tensor, "B J"], rests: Float[Tensor, "J R"]
+    observed: PartRotations,
+    state: Float[Tensor, "B J"],
+    rests: Float[Tensor, "J R"],
+    span: Float[Tensor, "D E"] | None = None,
 ) -> DeviationModel:
     """The likeliest deviations.
 
@@ -69,18 +73,20 @@ def learn_deviations(
         observed: Rotations of B views.
         state: Their states.
         rests: Of each hinge, to choose from.
+        span: Columns that the load is made of; None: any load.
     """
     joints = state.shape[1]
     noise = FIRST_NOISE * torch.eye(2 * joints)
+    span = torch.eye(2 * joints) if span is None else span
     best = DeviationModel(rest=rests[:, 0], load=noise[0], noise=noise)
     for j in list(range(joints)) * (2 if joints > 1 else 1):
         for place in rests[j]:
             rest = torch.where(torch.arange(joints) == j, place, best.rest)
-            start = DeviationModel(rest=rest, load=_first_load(observed, state, rest), noise=noise)
-            best = max(
-                best, _maximise(observed, state, start, STEPS), key=lambda model: model.likelihood
-            )
-    return _maximise(observed, state, best, LAST_STEPS)
+            load = _first_load(observed, state, rest, span)
+            start = DeviationModel(rest=rest, load=load, noise=noise)
+            found = _maximise(observed, state, start, span, STEPS)
+            best = max(best, found, key=lambda model: model.likelihood)
+    return _maximise(observed, state, best, span, LAST_STEPS)
 
 
 @torch.no_grad()
@@ -96,17 +102,24 @@ def expected_deviations(
 
 
 def _first_load(
-    observed: PartRotations, state: Float[Tensor, "B J"], rest: Float[Tensor, " J"]
+    observed: PartRotations,
+    state: Float[Tensor, "B J"],
+    rest: Float[Tensor, " J"],
+    span: Float[Tensor, "D E"],
 ) -> Float[Tensor, " D"]:
     """Where the rotations respond most: the likelihood has one peak and its mirror image."""
     turn = (observed.turn * observed.seen[..., None]).flatten(1)
     turn = turn / turn.norm(dim=-1, keepdim=True).clamp_min(OUTLYING)
-    back = (turn[:, None] @ _response(state, rest))[:, 0]
-    return FIRST_LOAD * torch.linalg.eigh(back.T @ back).eigenvectors[:, -1]
+    back = (turn[:, None] @ _response(state, rest))[:, 0] @ span
+    return FIRST_LOAD * span @ torch.linalg.eigh(back.T @ back).eigenvectors[:, -1]
 
 
 def _maximise(
-    observed: PartRotations, state: Float[Tensor, "B J"], start: DeviationModel, steps: int
+    observed: PartRotations,
+    state: Float[Tensor, "B J"],
+    start: DeviationModel,
+    span: Float[Tensor, "D E"],
+    steps: int,
 ) -> DeviationModel:
     """Expectation maximisation of load and noise, the rest held, and their likelihood."""
     joints = state.shape[1]
@@ -131,7 +144,8 @@ def _maximise(
             "b,bki,bkl,blj->ij", weight * mean**2 + variance, response, precision, response
         )
         right = torch.einsum("b,bki,bkl,bl->i", weight * mean, response, precision, turn)
-        load = torch.linalg.solve(system + RIDGE * eye, right)
+        inner = span.T @ (system + RIDGE * eye) @ span
+        load = span @ torch.linalg.solve(inner, span.T @ right)
         effect = (response @ load[:, None])[..., 0]
         left = torch.cat(
             [

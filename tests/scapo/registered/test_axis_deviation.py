@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import roma
 import torch
+from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.geometry.rotations import rotvec_to_rotmat
@@ -15,6 +16,7 @@ from scapo.records import take
 from scapo.registered import axis_deviation
 from scapo.registered.axis_deviation import (
     REACHES,
+    _spans,
     deviating_templates,
     observe_part_rotations,
     refine_deviations,
@@ -26,7 +28,7 @@ from scapo.registered.axis_deviation import (
 from scapo.registered.bundle_adjustment import Candidate, FitOptions, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.pose_search import SearchResult
-from scapo.registered.template import across_axis
+from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
 
@@ -100,6 +102,50 @@ def test_a_deviating_template_is_taken_where_held_out_views_deviate_and_tells_ho
     got, true = (one.rotation @ found.own_directions(one).mT for one in (at, truth))
     angle = torch.rad2deg((got * true).sum(1).clamp(max=1).arccos())
     assert angle.mean() < 2 / 3 * torch.rad2deg(torch.tensor(0.3))
+
+
+def test_parallel_hinges_are_first_asked_whether_they_stay_parallel() -> None:
+    assert _spans(template()) == [None]
+    made = ArticulatedTemplate(("revolute", "revolute"), 8)
+    made.axis.data = torch.tensor([[0.1, 0.0, 2.0], [0.0, -0.1, -1.0]])
+    span, whole = _spans(made)
+    assert whole is None
+    assert span is not None
+    turn = spread_across((span @ torch.tensor([0.2, -0.1])).view(1, 2, 2), made)[0]
+    assert_close(turn[0], turn[1], atol=0.02, rtol=0)  # one rotation of both, whatever their sense
+    assert turn.norm(dim=-1).min() > 0.2
+    made.axis.data = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    assert _spans(made) == [None]
+    slides = ArticulatedTemplate(("revolute", "prismatic"), 8)
+    assert _spans(slides) == [None]
+
+
+@pytest.mark.parametrize("gains", [(0.8,), (0.95, 0.8), (0.95, 0.95)])
+def test_the_first_span_that_explains_enough_is_taken(
+    gains: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, truth = sighted(8, seed=5)
+    start = Candidate(template=template(), inliers=Inliers(views=views, placement=truth))
+    made = [Candidate(template=template(), inliers=start.inliers) for _ in gains]
+    spans: list[Tensor | None] = [torch.ones(2, 1), None]
+    loss = {id(one.template): gain for one, gain in zip(made, gains, strict=True)}
+    found = SearchResult(placement=truth, loss=torch.zeros(8), margin=torch.zeros(8))
+    monkeypatch.setattr(axis_deviation, "_spans", lambda _: spans)
+    monkeypatch.setattr(axis_deviation, "search_views", lambda *_: found)
+    asked: list[Tensor | None] = []
+
+    def tried(*inputs: object) -> list[Candidate]:
+        asked.append(inputs[-1])
+        return [made[len(asked) - 1]]
+
+    def judged(one: ArticulatedTemplate, *_: object) -> tuple[Placement, Tensor]:
+        return truth, torch.full((8,), loss.get(id(one), 1.0))
+
+    monkeypatch.setattr(axis_deviation, "deviating_templates", tried)
+    monkeypatch.setattr(axis_deviation, "refine_deviations", judged)
+    taken = with_axis_deviation(start, views, DiscoveryConfig(), generator(0))
+    assert taken is (made[-1] if gains[-1] < 0.9 else start)
+    assert [one is None for one in asked] == [False, True][: len(gains)]
 
 
 @pytest.mark.slow

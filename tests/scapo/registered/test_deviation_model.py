@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import roma
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from scapo.registered.deviation_model import PartRotations, expected_deviations, learn_deviations
 from scapo.registered.template import across_axis
 from tests.helpers.strategies import generator
 
-AXES = torch.nn.functional.normalize(torch.tensor([[0.1, 0.0, 1.0], [0.0, -0.2, 1.0]]), dim=-1)
+AXES = F.normalize(torch.tensor([[0.1, 0.0, 1.0], [0.0, -0.2, 1.0]]), dim=-1)
 REST = torch.tensor([0.9, -0.8])
 LOAD = torch.tensor([[0.1, 0.02], [-0.03, 0.09]])
 
@@ -46,6 +47,18 @@ def test_rest_load_and_deviations_are_recovered() -> None:
     assert (model.noise.diagonal().sqrt() - 0.01).abs().max() < 0.005
     told = expected_deviations(model, observed, state)
     assert (told - amount[:, None, None] * LOAD).norm(dim=-1).mean() < 0.02
+
+
+def test_a_load_in_a_span_is_told_by_noisier_rotations() -> None:
+    span = F.normalize(LOAD.flatten(), dim=0)[:, None]
+    off = {"any": 0.0, "span": 0.0}
+    for seed in range(4):
+        observed, state, _ = drawn(60, 0.15, seed)
+        for name, within in (("any", None), ("span", span)):
+            load = learn_deviations(observed, state, REST[:, None], within).load
+            off[name] += float(1 - (load @ span).square() / load.square().sum())
+    assert off["span"] < 1e-5
+    assert off["any"] > 0.2  # a twentieth of the square lies elsewhere
 
 
 def test_a_hinge_that_is_not_seen_deviates_with_the_other_and_its_rotation_does_not_count() -> None:
