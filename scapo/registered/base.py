@@ -176,7 +176,7 @@ class AbstractRegistered(AbstractMethod):
         self.cpu()
         self.eval()  # it is asked, and learns nothing yet
         self.targets.clear()
-        index = evenly(len(cloud), self.config.placed).to(cloud.device)
+        index = evenly(len(cloud), self._taught()).to(cloud.device)
         cloud, labels = cloud[index].cpu(), map_tensors(take(labels, index), Tensor.cpu)
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
         makers = {kind.__name__: kind for kind in (Candidates, Placement)}

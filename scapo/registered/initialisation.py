@@ -30,9 +30,10 @@ FRAME_EVERY = 4  # Of the normals, one in so many tells the main directions
 AXES_OF_SEVERAL = 2
 """Proposals of each joint that are fitted, at most, where a category has several joints."""
 TEMPLATE_EVERY = 2  # Of all moved and still points, one in so many may become one of the template's
-PARTNERS = 5
-"""Views of its object before a view in a ring, and as many after it, that it is registered with: of
-20 views half of all pairs, by which nearly as many poses are right."""
+RING, PARTNERS = 20, 5
+"""Views of an object in a ring, and how many before a view, and as many after it, that it is
+registered with: half of all pairs, by which nearly as many poses are right."""
+LINKS = 4  # Of the ring, with which each further view of the object is registered
 SURENESS = 3.0  # Logit of the part that a point begins in
 
 
@@ -65,7 +66,7 @@ def common_frame(
 def registered_together(views: PartialViews, rotations: int, *, own: bool = False) -> Synchronised:
     """The poses of views on which their registrations with one another agree.
 
-    Views of one object, most of which match, are registered with some others (`PARTNERS`),
+    Views of one object, most of which match, are registered with some others (`pairs_of_one`),
     bare ones with all.
     """
     count = len(views.points)
@@ -78,12 +79,16 @@ def registered_together(views: PartialViews, rotations: int, *, own: bool = Fals
 def pairs_of_one(count: int) -> Int[Tensor, "Q 2"]:
     """Views of one object that are registered with one another: later and earlier.
 
-    >>> len(pairs_of_one(20)), len(pairs_of_one(5))
-    (100, 10)
+    >>> len(pairs_of_one(20)), len(pairs_of_one(5)), len(pairs_of_one(50))
+    (100, 10, 220)
     """
-    every = torch.combinations(torch.arange(count)).flip(-1)
+    ring = min(count, RING)
+    every = torch.combinations(torch.arange(ring)).flip(-1)
     apart = every[:, 0] - every[:, 1]
-    return every[torch.minimum(apart, count - apart) <= PARTNERS]
+    near = every[torch.minimum(apart, ring - apart) <= PARTNERS]
+    further = torch.arange(ring, count).repeat_interleave(LINKS)
+    spread = (RING // LINKS) * torch.arange(LINKS).repeat(count - ring)
+    return torch.cat([near, torch.stack([further, (further + spread) % RING], 1)])
 
 
 def surest_of(poses: Synchronised, share: float) -> Int[Tensor, " K"]:

@@ -72,7 +72,7 @@ from scapo.types import Labels, Observation, Prediction, Supervision
 
 logger = logging.getLogger(__name__)
 
-FRAME = 2.2  # Seconds of one core for an object's views that are registered with one another
+FRAME = 4.0  # Seconds of one core for an object's views that are registered with one another
 TURNED = 50  # Clouds that are placed at a time as their objects stand
 
 
@@ -138,11 +138,19 @@ class TemplateRegistration(AbstractRegistered):
 
     def stages(self) -> tuple[Stage, ...]:
         """The network's rounds, of all of it or of what it says of hinges."""
-        made = super().stages()
+        share = super()._taught() / self._taught()
+        made = tuple(
+            replace(stage, epochs=max(1, round(share * stage.epochs))) for stage in super().stages()
+        )
         if self.config.teach == "all":
             return made
         hinges = (ParameterGroup(module="network.hinge"),)
         return tuple(replace(stage, parameters=hinges) for stage in made)
+
+    def _taught(self) -> int:
+        """More views of each object where objects say how they stand."""
+        asked = self.config.stand == "objects" and self.config.camera == "known"
+        return self.config.of_objects if asked else super()._taught()
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """As `AbstractRegistered`; what is not taught does not take on means of batches either."""
@@ -214,14 +222,18 @@ class TemplateRegistration(AbstractRegistered):
             return super()._trusted(found, cloud, labels, generator)
         if self._frames is None:
             self._frames = self._frames_of(cloud, known, generator)
-        frames, ways = how_objects_stand(self._frames, self.orientation)
+        said = self._turns_of(cloud, self._frames)
+        frames, ways = how_objects_stand(self._frames, self.orientation, said)
         if not frames:
-            logger.warning("how objects stand is not known: the views of none are of one mind")
+            logger.warning("how objects stand is not known: of none one way leads the others")
             return super()._trusted(found, cloud, labels, generator)
         agrees = agreeing(found, frames, ways)[1]
         row, wanted = against(agrees, frames, ways)
-        said = "%.0f %% of the clouds stand as their objects do; %d more are asked whether they may"
-        logger.info(said, 100 * agrees.float().mean(), len(row))
+        logger.info(
+            "%d of %d objects are told; %.0f %% of the clouds stand as they do; "
+            "%d more are asked whether they may",
+            len(frames), len(known), 100 * agrees.float().mean(), len(row),
+        )  # fmt: skip
         if len(row):
             other = self._turned(cloud[row], wanted, generator)
             found = exchanged(found, row, other)
@@ -248,6 +260,15 @@ class TemplateRegistration(AbstractRegistered):
             self.journal.tell(f"object {k} of {len(jobs)}", k / len(jobs), left)
             frames.append(self.journal.once(f"frame of object {k}", make, generator, makers))
         return frames
+
+    def _turns_of(
+        self, cloud: Tensor, frames: list[ObjectFrame]
+    ) -> list[Float[Tensor, "V 3 3"]] | None:
+        """view_R_template of the views of each frame, by the network; None: it has not learned."""
+        if not (isinstance(self.network, ViewNetwork) and bool(self.network.learned)):
+            return None
+        jobs = [partial(self._of_view, Observation(points=cloud[one.row])) for one in frames]
+        return [make()[0].rotation for make in self.journal.ahead(jobs)]
 
     def _turned(
         self, cloud: Tensor, wanted: Float[Tensor, "B 3 3"], generator: torch.Generator

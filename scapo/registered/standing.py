@@ -5,9 +5,10 @@ A template that fits an object upside down nearly as well as upright is placed w
 its views, and a network that learns from these learns both. Views of one object need no template
 to be brought together: its shape is the same in all. Then one rotation is left open for all of its
 views, a quarter turn of the main directions of its surface. Which, a scorer tells that has learned
-how views look that stand right (`orientation`), by all views of the object: it is wrong of these
-less often than of one. Views of which it says another turn are left out: nearly half of them stand
-wrongly, of the others one in ten. So are objects whose views are not of one mind.
+how views look that stand right (`orientation`), and the network once it has learned, by all views
+of the object: they are wrong of these less often than of one, and seldom of the same objects. Views
+of which both say another turn are left out: nearly half of them stand wrongly. So are objects of
+which another turn is told nearly as well.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -28,10 +30,12 @@ from scapo.registered.pairwise import within
 from scapo.registered.pseudo_labels import Candidates
 from scapo.registered.views import PartialViews
 
+NEAREST = 45.0  # Degrees within which a view is nearer to one quarter turn than to the others
 NEAR = 30.0  # Degrees from its object's way within which a candidate says the same
 AGAINST = 1.0  # Loss that another candidate costs
 LEAST_NATS = -4.0  # What a view can hold against a way at most
-LEAST_SHARE = 0.6  # Of an object's views that say the same as all; where fewer do, all may be wrong
+LEAST_SHARE = 0.03  # Of the views that the network has standing in a way, beside what it says
+MARGIN = 1.0  # Nats by which a way of standing has to lead the next: where it does not, it is open
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,23 +70,31 @@ def frame_of(row: Int[Tensor, " N"], views: PartialViews, rotations: int) -> Obj
 
 @torch.no_grad()
 def how_objects_stand(
-    frames: Sequence[ObjectFrame], scorer: OrientationScorer
+    frames: Sequence[ObjectFrame],
+    scorer: OrientationScorer,
+    said: Sequence[Float[Tensor, "V 3 3"]] | None = None,
 ) -> tuple[list[ObjectFrame], list[Float[Tensor, "3 3"]]]:
-    """The objects whose views are of one mind, without the others, and object_R_template.
+    """The objects that are told, with the views that say the same, and object_R_template.
 
     Args:
         frames: Of objects.
         scorer: Of frames of single views.
+        said: view_R_template of all their views, by the network; None: it has not learned.
     """
     kept, ways = list[ObjectFrame](), list[Tensor]()
-    for one in frames:
+    for k, one in enumerate(frames):
         normals = one.views.normals[:, ::FRAME_EVERY] @ one.turn
         every = principal_frame(normals.flatten(0, 1)).mT @ quarter_turns()
-        nats = scorer(one.views, one.turn[:, None] @ every).log_softmax(-1)
-        likely = int(nats.clamp_min(LEAST_NATS).mean(0).argmax())
-        same = nats.argmax(1) == likely
-        if float(same.float().mean()) >= LEAST_SHARE:
-            kept.append(take(one, same))
+        turns = one.turn[:, None] @ every  # (V, 24, 3, 3)
+        nats = scorer(one.views, turns).log_softmax(-1)
+        score, same = nats.clamp_min(LEAST_NATS).mean(0), F.one_hot(nats.argmax(1), len(every)) > 0
+        if said is not None:
+            near = within((turns * said[k][:, None]).sum((-1, -2)), NEAREST)
+            score, same = score + (near.float().mean(0) + LEAST_SHARE).log(), same | near
+        best = score.topk(2)
+        likely = int(best.indices[0])
+        if float(best.values[0] - best.values[1]) >= MARGIN:
+            kept.append(take(one, same[:, likely]))
             ways.append(every[likely])
     return kept, ways
 

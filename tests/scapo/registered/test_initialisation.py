@@ -11,7 +11,9 @@ import torch
 from scapo.geometry.rigid import axis_angle
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.initialisation import (
+    LINKS,
     PARTNERS,
+    RING,
     first_template,
     fitted_proposals,
     pairs_of_one,
@@ -57,11 +59,17 @@ def test_still_points_begin_as_base_and_moved_ones_as_parts_of_the_proposed_join
     assert torch.equal(made.pivot[0], PIVOT)
 
 
-def test_views_of_one_object_are_registered_with_as_many_others_each():
-    pairs = pairs_of_one(24)
+def test_views_of_one_object_are_registered_with_others_of_a_ring():
+    pairs = pairs_of_one(RING)
     assert (pairs[:, 0] > pairs[:, 1]).all()
-    assert len(pairs.unique(dim=0)) == len(pairs) == 24 * PARTNERS
-    assert pairs.flatten().bincount().tolist() == [2 * PARTNERS] * 24
-    assert [23, 4] in pairs.tolist()
+    assert len(pairs.unique(dim=0)) == len(pairs) == RING * PARTNERS
+    assert pairs.flatten().bincount().tolist() == [2 * PARTNERS] * RING
+    assert [RING - 1, 4] in pairs.tolist()
     assert len(pairs_of_one(11)) == 55  # all
     assert len(pairs_of_one(2)) == 1
+    more = pairs_of_one(2 * RING)
+    assert torch.equal(more[: len(pairs)], pairs)
+    further, known = more[len(pairs) :].unbind(1)
+    assert further.bincount()[RING:].tolist() == [LINKS] * RING
+    assert known.bincount().tolist() == [LINKS] * RING  # none is asked more often than others
+    assert len(more.unique(dim=0)) == len(more)

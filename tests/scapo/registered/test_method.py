@@ -228,6 +228,15 @@ def test_rounds_over_the_clouds_that_were_placed():
     assert sum(p.numel() for p in made.parameters()) < 1_500_000
 
 
+def test_more_clouds_are_placed_where_objects_say_how_they_stand():
+    config = RegisteredConfig(epochs=10, placed=20, of_objects=50, supervision=("instance",))
+    taught = {}
+    for category in ("drawer", "oven"):
+        made = TemplateRegistration(config, CATEGORIES[category], generator(0))
+        taught[category] = [(stage.epochs, stage.clouds) for stage in made.stages()]
+    assert taught == {"drawer": [(2, 50), (4, 50)], "oven": [(5, 20), (10, 20)]}
+
+
 @pytest.mark.slow
 def test_the_known_camera_moves_with_the_cloud():
     method, observation = trained()

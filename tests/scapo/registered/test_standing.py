@@ -32,7 +32,7 @@ from scapo.registered.standing import (
 )
 from scapo.registered.template import Placement
 from scapo.registered.views import PartialViews
-from scapo.types import Labels
+from scapo.types import Labels, Observation
 from tests.helpers.sighted import sighted
 from tests.helpers.strategies import generator
 
@@ -135,6 +135,19 @@ def test_objects_whose_views_are_of_two_minds_are_left_out() -> None:
     assert how_objects_stand(frames, OfTwoMinds()) == ([], [])
 
 
+def test_what_the_network_says_is_counted_beside_the_scorer() -> None:
+    _, frames, truth, way = seen_from_above()
+    said = [truth[one.row] for one in frames]
+    kept, ways = how_objects_stand(frames, OfTwoMinds(), said)  # the scorer alone tells none
+    assert rotation_angle(torch.stack(ways), way).rad2deg().max() < 5
+    assert all(torch.equal(left.row, one.row) for left, one in zip(kept, frames, strict=True))
+    said[1] = said[1] @ DOWN
+    _, ways = how_objects_stand(frames, OfTwoMinds(), said)  # told by the network alone
+    assert rotation_angle(ways[1], way[1] @ DOWN).rad2deg() < 5
+    kept, _ = how_objects_stand(frames, FromAbove(), said)  # contradicted, it is open
+    assert [int(left.row[0]) // EACH for left in kept] == [0, 2, 3, 4, 5]
+
+
 def test_candidates_against_their_object_are_charged() -> None:
     found, frames, truth, way = seen_from_above()
     charged, agrees = agreeing(found, frames[1:], list(way[1:]))
@@ -234,6 +247,34 @@ def test_objects_are_asked_where_they_are_known_and_look_one_way(
     assert_close(best[says], truth[says], atol=1e-5, rtol=0)
     again, _ = method._trusted(found, cloud, labels, generator(1))  # frames are asked for once
     assert torch.equal(again.gap, learned.gap)
+
+
+def test_a_network_that_has_learned_is_asked_about_the_views_of_objects(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    found, frames, truth, _ = seen_from_above()
+    config = replace(RegisteredConfig(), stand="objects", supervision=("instance",))
+    method = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
+    method.orientation = OfTwoMinds()
+    method.orientation.learned.fill_(1.0)
+    method._frames = frames
+    labels = Labels(instance=torch.arange(OBJECTS).repeat_interleave(EACH))
+    cloud = torch.arange(float(len(truth)))[:, None, None].expand(-1, 5, 3)
+
+    def said(observation: Observation) -> tuple[Placement, Tensor, None]:
+        turn = truth[observation.points[:, 0, 0].long()]
+        none = torch.zeros(len(turn), 3)
+        return Placement.at(turn, none, none[:, :1]), none[:, 0], None
+
+    monkeypatch.setattr(method, "_of_view", said)
+    _, trust = method._trusted(found, cloud, labels, generator(1))
+    assert int(trust.sum()) == round(0.85 * len(trust))  # objects are open, so the surest views
+    method.network.learned.fill_(1.0)
+    learned, trust = method._trusted(found, cloud, labels, generator(1))
+    assert trust.all()
+    best = learned.placement.rotation.unflatten(0, learned.gap.shape)
+    best = best[torch.arange(len(truth)), learned.gap.argmin(1)]
+    assert_close(best, truth, atol=1e-5, rtol=0)
 
 
 def take_two(found: Candidates, wanted: Tensor) -> Candidates:
