@@ -132,7 +132,7 @@ def test_the_first_span_that_explains_enough_is_taken(
     found = SearchResult(placement=truth, loss=torch.zeros(8), margin=torch.zeros(8))
     monkeypatch.setattr(axis_deviation, "_spans", lambda _: spans)
     monkeypatch.setattr(axis_deviation, "search_views", lambda *_: found)
-    asked: list[Tensor | None] = []
+    asked: list[object] = []
 
     def tried(*inputs: object) -> list[Candidate]:
         asked.append(inputs[-1])

@@ -255,8 +255,8 @@ def test_a_network_that_has_learned_is_asked_about_the_views_of_objects(
     found, frames, truth, _ = seen_from_above()
     config = replace(RegisteredConfig(), stand="objects", supervision=("instance",))
     method = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
-    method.orientation = OfTwoMinds()
-    method.orientation.learned.fill_(1.0)
+    method.orientation = scorer = OfTwoMinds()
+    scorer.learned.fill_(1.0)
     method._frames = frames
     labels = Labels(instance=torch.arange(OBJECTS).repeat_interleave(EACH))
     cloud = torch.arange(float(len(truth)))[:, None, None].expand(-1, 5, 3)
@@ -269,7 +269,7 @@ def test_a_network_that_has_learned_is_asked_about_the_views_of_objects(
     monkeypatch.setattr(method, "_of_view", said)
     _, trust = method._trusted(found, cloud, labels, generator(1))
     assert int(trust.sum()) == round(0.85 * len(trust))  # objects are open, so the surest views
-    method.network.learned.fill_(1.0)
+    method.network.load_state_dict({**method.network.state_dict(), "learned": torch.ones(())})
     learned, trust = method._trusted(found, cloud, labels, generator(1))
     assert trust.all()
     best = learned.placement.rotation.unflatten(0, learned.gap.shape)
