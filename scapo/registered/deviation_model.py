@@ -147,12 +147,8 @@ def _maximise(
         inner = span.T @ (system + RIDGE * eye) @ span
         load = span @ torch.linalg.solve(inner, span.T @ right)
         effect = (response @ load[:, None])[..., 0]
-        left = torch.cat(
-            [
-                (turn - effect * mean[:, None]) * seen * weight[:, None].sqrt(),
-                effect * seen * variance[:, None].sqrt(),
-            ]
-        )
+        off = (turn - effect * mean[:, None]) * seen * weight[:, None].sqrt()
+        left = torch.cat([off, effect * seen * variance[:, None].sqrt()])
         noise = left.T @ left * alone / seen.sum(0).clamp_min(1)[:, None] + LEAST_NOISE * eye
         noise = (noise + noise.T) / 2
     return DeviationModel(rest=start.rest, load=load, noise=noise, likelihood=float(likelihood))

@@ -85,7 +85,7 @@ def test_the_origin_is_that_of_the_whole_shape_where_parts_do_not_tell_it() -> N
     assert true.canonical_points is not None
     assert true.camera_T_part is not None
     box = torch.tensor([0.1, 0.05, 0.02], dtype=torch.float64)  # of the middle, in units
-    length = torch.rand(COUNT, 1, 1, dtype=torch.float64) * unit[:, None, None]
+    length = torch.as_tensor(rng.random((COUNT, 1, 1))) * unit[:, None, None]
     line = torch.linspace(-0.5, 0.5, true.canonical_points.shape[1])[:, None].double()
     shape = line * length * torch.tensor([1.0, 0, 0]) + (box * unit[:, None])[:, None]
     far = shape[:, -1] - (box * unit[:, None])
