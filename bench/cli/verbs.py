@@ -196,9 +196,10 @@ class Run(requests.GridRequest):
         grid = Grid(self)
         plan, chains = grid.plan(lambda line: say(console, line))
         status = grid.status(plan, chains)
-        say(console, f"{len(chains)} trainings, {len(status.estimate.left)} of "
-            f"{sum(len(one.steps) for one in plan.chains)} steps of the plan are left; these take "
-            f"{in_words(*status.seconds_left())} with {status.workers} at a time")  # fmt: skip
+        steps = [(one.name, step.name) for one in chains for step in one.steps]
+        left = sum(step in status.estimate.left for step in steps)
+        say(console, f"{len(chains)} trainings, {left} of their {len(steps)} steps are left; "
+            f"these take {in_words(*status.seconds_left())} with {status.workers} at a time")  # fmt: skip
         if self.plan_only:
             return
         with shown(console, status):

@@ -52,7 +52,7 @@ def test_the_quick_twin_of_smoke(folder: Path, capsys):
     with pytest.raises(RuntimeError, match="found 1 that failed; the same command tries"):
         said(words(folder))
     text = capsys.readouterr().out
-    assert "3 trainings, 15 of 15 steps of the plan are left; these take about" in text
+    assert "3 trainings, 15 of their 15 steps are left; these take about" in text
     assert "clean/oven/icp/seed1: 5 made" in text
     assert "clean/oven/scapo/seed13: 1 failed, 3 not run" in text
     assert "failed: clean/oven/scapo/seed13: " in text
@@ -63,7 +63,9 @@ def test_the_quick_twin_of_smoke(folder: Path, capsys):
 
 
 def test_plan_only_writes_the_plan_alone(folder: Path):
-    assert "15 steps of the plan" in said(words(folder, plan_only=True))
+    assert "15 of their 15 steps" in said(words(folder, plan_only=True))
+    some = said(words(folder, plan_only=True, only=("icp",)))
+    assert "1 trainings, 5 of their 5 steps are left" in some
     assert [path.name for path in (folder / "out").iterdir()] == ["plan.json"]
     assert calls(folder) == []
 
