@@ -198,8 +198,11 @@ class Run(requests.GridRequest):
         status = grid.status(plan, chains)
         steps = [(one.name, step.name) for one in chains for step in one.steps]
         left = sum(step in status.estimate.left for step in steps)
-        say(console, f"{len(chains)} trainings, {left} of their {len(steps)} steps are left; "
-            f"these take {in_words(*status.seconds_left())} with {status.workers} at a time")  # fmt: skip
+        say(
+            console,
+            f"{len(chains)} trainings, {left} of their {len(steps)} steps are left; these take "
+            f"{in_words(*status.seconds_left())} with {status.workers} at a time",
+        )
         if self.plan_only:
             return
         with shown(console, status):
