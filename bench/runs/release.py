@@ -44,7 +44,8 @@ MODES: tuple[Mode, ...] = ("fast", "quick")
 LABELLED_SPLIT = "train"
 CHECKS = "checks"
 """Folder of the answers, beside that of the checkpoints."""
-FORMAT = "scapo-answers/1"
+FORMAT = "scapo-answers/2"
+WHOLE = 255  # A part's weight of 1, as answers are kept
 LEGEND = (
     "Means. S: part IoU; D: direction of the joints; C: their pivots; R, t: poses of the parts. C "
     "and t in units of 4 x the cloud's mean radius. `objects known`: told in training which clouds "
@@ -204,16 +205,17 @@ def compare_answers(checkpoint: Path) -> dict[str, Differences]:
     found = {}
     for mode, said in _asked(checkpoint, kept["points"]):
         off = {
-            name: np.abs(said[name] - kept[f"{mode}/{name}"].astype(np.float32)) for name in said
+            name: np.abs(value.astype(np.float32) - kept[f"{mode}/{name}"])
+            for name, value in said.items()
         }
         found[mode] = Differences(
-            part_weight=off["part_weight"].max((1, 2)), pose=off["camera_T_part"].max((1, 2, 3))
+            part_weight=off["part_weight"].max((1, 2)) / WHOLE, pose=off["camera_T_part"].max((1, 2, 3))
         )
     return found
 
 
 def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[str, np.ndarray]]]:
-    """The answers of each mode, weights in half precision."""
+    """The answers of each mode, weights as bytes."""
     method, header = load(checkpoint)
     model = Predictor(method, "cpu", check_header(header, str(checkpoint)).alignment)
     for mode in MODES:
@@ -221,7 +223,7 @@ def _asked(checkpoint: Path, points: np.ndarray) -> Iterator[tuple[Mode, dict[st
             said = model.predict(points, mode)
         if said.part_weight is None or said.camera_T_part is None:
             raise StoreError(f"{checkpoint}: expected parts and poses in mode {mode}, found none")
-        yield mode, {"part_weight": said.part_weight.half().numpy(),
+        yield mode, {"part_weight": (WHOLE * said.part_weight).round().byte().numpy(),
                      "camera_T_part": said.camera_T_part.float().numpy()}  # fmt: skip
 
 
