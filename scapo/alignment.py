@@ -24,6 +24,8 @@ from scapo.types import Joints, Prediction
 
 RIGID = 1e-3
 """Largest deviation of an offset from a rigid motion."""
+STANDS = 0.98
+"""Cosine with up from which an axis stands: 11 degrees."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,12 +97,19 @@ class Alignment:
         """How many were fitted; signs and the order are none."""
         return 6 * len(self.order) + len(self.zero) + len(self.origin or ())
 
-    @property
-    def up(self) -> tuple[float, ...] | None:
-        """Which way is up (z) in the method's own frame of its first part, if that is the base."""
-        if self.order[0] != 0:
-            return None
-        return tuple(row[2] for row in self.own_T_part[0][:3])
+    def up(self, axes: Float[Tensor, "J 3"] | None = None) -> tuple[float, ...] | None:
+        """Which way is up (z) in the method's own frame of its first part, if no state tilts that.
+
+        Args:
+            axes: Of its joints, in that frame. Where the first part is not the base but what the
+                only joint moves, that joint has to stand.
+        """
+        first = self.order[0]
+        up = tuple(row[2] for row in self.own_T_part[first][:3])
+        if first == 0:
+            return up
+        stands = axes is not None and len(axes) == 1
+        return up if stands and abs(float(axes[0] @ axes.new_tensor(up))) > STANDS else None
 
     def apply(self, found: Prediction, unit: Float[Tensor, "*B"], category: Category) -> Prediction:
         """The prediction by the category's conventions.

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from scapo.categories import Category
@@ -222,7 +222,7 @@ class AbstractMethod(nn.Module, ABC):
     takes_up: ClassVar[bool] = False
     """Whether it uses `Observation.up`."""
     up: tuple[float, ...] | None = None
-    """Which way is up in the base's own frame, where labels told (`Alignment.up`)."""
+    """Which way is up in the first part's own frame, where labels told (`Alignment.up`)."""
     config: Any
     """A frozen dataclass; stored in checkpoints."""
     category: Category
@@ -236,6 +236,10 @@ class AbstractMethod(nn.Module, ABC):
     @abstractmethod
     def variant(self) -> str:
         """How this run differs from the method's default, as tables name it; "" = it does not."""
+
+    def axes(self) -> Float[Tensor, "J 3"] | None:
+        """Unit directions of its joints in the first part's own frame, if they never differ."""
+        return None
 
     @abstractmethod
     def stages(self) -> tuple[Stage, ...]:

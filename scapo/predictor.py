@@ -50,7 +50,7 @@ class Predictor:
         """
         self.model = model.to(device).eval()
         self.device, self.alignment = device, alignment
-        self.model.up = None if alignment is None else alignment.up
+        self.model.up = None if alignment is None else alignment.up(model.axes())
 
     @property
     def in_object_frame(self) -> bool:

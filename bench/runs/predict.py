@@ -102,7 +102,7 @@ def _tell_up(method: AbstractMethod, known: Alignment | None, request: PredictRe
     Raises:
         ValueError: It is to be told more and cannot use it.
     """
-    method.up = None if known is None else known.up
+    method.up = None if known is None else known.up(method.axes())
     if request.up and not (method.takes_up and method.up is not None):
         raise ValueError(f"--up: expected a model that can use it, found {method.name}")
 

@@ -209,7 +209,8 @@ def compare_answers(checkpoint: Path) -> dict[str, Differences]:
             for name, value in said.items()
         }
         found[mode] = Differences(
-            part_weight=off["part_weight"].max((1, 2)) / WHOLE, pose=off["camera_T_part"].max((1, 2, 3))
+            part_weight=off["part_weight"].max((1, 2)) / WHOLE,
+            pose=off["camera_T_part"].max((1, 2, 3)),
         )
     return found
 

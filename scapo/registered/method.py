@@ -177,6 +177,10 @@ class TemplateRegistration(AbstractRegistered):
         elif self.config.teach == "hinges":
             raise ValueError("teach: expected objects with a hinge and several views, found none")
 
+    def axes(self) -> Float[Tensor, "J 3"]:
+        """Of the template's joints."""
+        return self.template.directions().detach()
+
     @property
     def variant(self) -> str:
         """The preset, whether objects were known, and options that differ from the preset's."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch.testing import assert_close
 
 from scapo.alignment import Alignment, ObjectFrame, unit_length
@@ -39,12 +40,24 @@ def test_up_is_told_in_the_own_frame_of_a_base_that_comes_first() -> None:
     category, rng = CATEGORIES["eyeglasses"], np.random.default_rng(4)
     own, truth = convention((0, 2, 1), rng), true_answers(category, 3, rng)
     said = in_own_words(truth, own, UNIT, category).camera_T_part
-    assert own.up is not None
     assert said is not None
     assert truth.camera_T_part is not None
-    up = said[:, 0, :3, :3] @ torch.tensor(own.up, dtype=torch.float64)
+    told = own.up()
+    assert told is not None
+    up = said[:, 0, :3, :3] @ torch.tensor(told, dtype=torch.float64)
     assert_close(up, truth.camera_T_part[:, 0, :3, 2], atol=1e-9, rtol=0)
-    assert convention((1, 0), rng).up is None
+
+
+def test_up_is_told_by_a_moving_part_that_comes_first_where_its_hinge_stands() -> None:
+    own = convention((1, 0), np.random.default_rng(4))
+    up = torch.tensor(own.own_T_part[1])[:3, 2]
+    across = F.normalize(torch.linalg.cross(up, up.roll(1)), dim=0)
+    some = ((None, False), (up[None], True), (-up[None], True), (across[None], False),
+            (up.expand(2, 3), False))  # fmt: skip
+    for axes, told in some:
+        found = own.up(axes)
+        assert (found is not None) == told
+        assert found is None or found == pytest.approx(up.tolist())
 
 
 def test_a_shape_whose_parts_nobody_knows_is_left_out_and_what_is_not_said_stays_so() -> None:
