@@ -108,8 +108,9 @@ class Alignment:
         up = tuple(row[2] for row in self.own_T_part[first][:3])
         if first == 0:
             return up
-        stands = axes is not None and len(axes) == 1
-        return up if stands and abs(float(axes[0] @ axes.new_tensor(up))) > STANDS else None
+        if axes is None or len(axes) > 1:
+            return None
+        return up if abs(float(axes[0] @ axes.new_tensor(up))) > STANDS else None
 
     def apply(self, found: Prediction, unit: Float[Tensor, "*B"], category: Category) -> Prediction:
         """The prediction by the category's conventions.
