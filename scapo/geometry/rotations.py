@@ -13,6 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 FEW = 9 * 256  # Entries of matrices
+ACROSS = torch.tensor([
+    [0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0],
+])  # fmt: skip
+"""A vector times this: the matrix of the cross product with it, row by row."""
 
 
 def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
@@ -23,9 +27,7 @@ def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     >>> rotvec_to_rotmat(torch.tensor([0.0, 0, torch.pi / 2]))[1, 0].round()
     tensor(1.)
     """
-    x, y, z = vector.unbind(-1)
-    none = torch.zeros_like(x)
-    across = torch.stack([none, -z, y, z, none, -x, -y, x, none], -1).unflatten(-1, (3, 3))
+    across = (vector[..., None] * ACROSS.to(vector)).sum(-2).unflatten(-1, (3, 3))
     eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
     turns = torch.linalg.vector_norm(vector, dim=-1)[..., None, None] / torch.pi
     twice = (turns / 2).sinc().square() / 2
