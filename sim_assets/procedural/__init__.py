@@ -114,20 +114,3 @@ def generate(category: str, split: str, seed: int, index: int) -> ArticulatedObj
         digest(shape),
         shape.trait,
     )
-
-
-def generate_symmetric(category: str, seed: int = 0) -> ArticulatedObject:
-    """An instance that its category's swap symmetry maps onto itself, parts exchanged.
-
-    Raises:
-        ValueError: The category has no swap symmetry.
-    """
-    made = recipe(category)
-    if made.symmetric is None:
-        raise ValueError(f"category {category!r}: expected one with a swap symmetry")
-    drawn = draw(made.shape, _generator(category, "symmetric", seed))
-    shape = replace(drawn, **made.symmetric)
-    source = f"procedural/{category}/symmetric/{seed}"
-    return assemble(
-        category, f"{category}-symmetric-{seed}", made.build(shape), source, digest(shape)
-    )

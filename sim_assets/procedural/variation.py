@@ -15,9 +15,6 @@ from jaxtyping import Float
 
 from sim_assets.objects import ArticulatedObject
 
-LEAST = 0.15
-"""Coefficient of variation that every main proportion of a category has (docs/variation.md)."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Statistic:
@@ -25,7 +22,7 @@ class Statistic:
 
     name: str
     main: bool
-    """Whether its coefficient is held to at least `LEAST`."""
+    """Whether its coefficient is held to at least 0.15 (docs/variation.md)."""
     count: int
     mean: float
     variation: float
@@ -90,11 +87,6 @@ def statistics(objects: Iterable[ArticulatedObject]) -> list[Statistic]:
         result.append(_row(f"{part} pivot/body", distance, spread, main=True))
         result.append(_row(f"{part} tilt (deg)", angles, angles.std(), main=False))
     return result
-
-
-def coefficients(objects: Iterable[ArticulatedObject]) -> dict[str, float]:
-    """Coefficient of variation of each main proportion of objects of one category."""
-    return {entry.name: entry.variation for entry in statistics(objects) if entry.main}
 
 
 def _statistic(name: str, values: list[float]) -> Statistic:

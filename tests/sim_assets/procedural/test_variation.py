@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 from math import radians
 
@@ -15,9 +16,10 @@ from sim_assets.procedural import RECIPES, generate
 from sim_assets.procedural.assembly import Design, assemble, mirrored_design, painted
 from sim_assets.procedural.parameters import OTHER_SIDE, OTHER_WAY, PROPORTIONS, SET_BACK
 from sim_assets.procedural.shapes import box
-from sim_assets.procedural.variation import LEAST, axis_foot, coefficients, proportions, tilt
+from sim_assets.procedural.variation import axis_foot, proportions, statistics, tilt
 
 categories = pytest.mark.parametrize("category", RECIPES)
+LEAST = 0.15  # Of the coefficient of variation of every main proportion (docs/variation.md)
 # Coefficients of variation of five ovens and dishwashers, six microwave ovens and fridges, four
 # cabinets and three eyeglasses (docs/variation.md), where above 0.15.
 REAL = {
@@ -50,6 +52,11 @@ def boxes(door: float, lean: float = 0.0) -> ArticulatedObject:
         upper=[1.0],
     )
     return assemble("oven", "boxes", design, "boxes", "0")
+
+
+def coefficients(objects: Iterable[ArticulatedObject]) -> dict[str, float]:
+    """Coefficient of variation of each main proportion of objects of one category."""
+    return {entry.name: entry.variation for entry in statistics(objects) if entry.main}
 
 
 def test_proportions_of_boxes():
