@@ -26,43 +26,25 @@ from bench.matching import (
 from scapo.geometry.part_order import confusion, hard_labels
 
 ApRule = Literal["mean", "min", "per-part"]
-
-
 IouKind = Literal["hard", "soft"]
-
-
 PivotKind = Literal["point-line", "line-line"]
-
-
 RotationKind = Literal["full", "folded"]
-
 
 PARALLEL = 1e-6
 """Sine below which two lines count as parallel."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Metric:
-    """What a name in the scores means."""
-
-    name: str
-    per: Literal["part", "joint", "sample"]
-    higher_is_better: bool | None
-    """None: neither."""
-    units: tuple[str, ...]
-    """As in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
-
-
-METRICS = (
-    Metric(name="iou", per="part", higher_is_better=True, units=("1",)),
-    Metric(name="joint_direction", per="joint", higher_is_better=False, units=("deg",)),
-    Metric(name="joint_pivot", per="joint", higher_is_better=False, units=("r4", "m")),
-    Metric(name="joint_state", per="joint", higher_is_better=False, units=("deg", "r4", "m")),
-    Metric(name="part_rotation", per="part", higher_is_better=False, units=("deg",)),
-    Metric(name="part_translation", per="part", higher_is_better=False, units=("r4", "m")),
-    Metric(name="reconstruction", per="sample", higher_is_better=False, units=("r4", "m")),
-    Metric(name="order", per="part", higher_is_better=None, units=("1",)),
-)
+METRICS = {
+    "iou": ("1",),
+    "joint_direction": ("deg",),
+    "joint_pivot": ("r4", "m"),
+    "joint_state": ("deg", "r4", "m"),
+    "part_rotation": ("deg",),
+    "part_translation": ("r4", "m"),
+    "reconstruction": ("r4", "m"),
+    "order": ("1",),
+}
+"""Units of each name in the scores; `r4`: 1 = 4 x the mean radius of the cloud."""
 
 
 def sample_errors(  # noqa: PLR0913

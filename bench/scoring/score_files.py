@@ -44,8 +44,7 @@ LONGEST_NAME = 300
 """Characters of a name; a variant is that of the predictions and the readings of the metrics."""
 CALIBRATED = ("part_rotation", "part_translation", "joint_state")
 """Metrics that need the frames or the states to be the category's."""
-_RANK = {metric.name: rank for rank, metric in enumerate(METRICS)}
-_UNITS = {(metric.name, unit) for metric in METRICS for unit in metric.units}
+_RANK = {name: rank for rank, name in enumerate(METRICS)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -400,9 +399,9 @@ def _checked(path: Path, frame: Any, names: Sequence[str]) -> Any:  # noqa: ANN4
 def _arrays(path: Path, rows: Any, samples: Int[np.ndarray, " B"]) -> Errors:  # noqa: ANN401
     errors: Errors = {}
     for (name, unit), group in rows.groupby(["metric", "unit"], sort=False):
-        if name not in _RANK:
-            raise StoreError(f"{path}: expected metrics {', '.join(_RANK)}, found {name!r}")
-        if (name, unit) not in _UNITS:
+        if name not in METRICS:
+            raise StoreError(f"{path}: expected metrics {', '.join(METRICS)}, found {name!r}")
+        if unit not in METRICS[name]:
             raise StoreError(f"{path}: metric {name!r}: expected one of its units, found {unit!r}")
         slots = group["slot"].to_numpy()
         count = int(slots.max()) + 1
