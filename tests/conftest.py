@@ -47,6 +47,12 @@ def update_golden(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--update-golden"))
 
 
+@pytest.fixture(scope="session")
+def raycast() -> None:
+    """For tests that render by casting rays; skips where Embree is not installed."""
+    pytest.importorskip("embreex")
+
+
 @pytest.fixture
 def shapes_checked(request: pytest.FixtureRequest) -> None:
     """For tests of what the checker refuses: skipped where it is off, as in `make coverage`."""

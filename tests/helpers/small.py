@@ -8,7 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.testing import assert_close
 
+from scapo.method import AbstractMethod
+from scapo.types import Observation
 from tests.helpers.hinged import plates
 from tests.helpers.splits import write_split
 
@@ -74,6 +79,25 @@ def settle(module: M) -> M:
         if isinstance(one, torch.nn.BatchNorm1d):
             one.momentum = 1.0
     return module
+
+
+def assert_turns_with(
+    method: AbstractMethod, points: Float[Tensor, "B N 3"], rotation: Float[Tensor, "3 3"]
+) -> None:
+    """What a method says of turned clouds is what it said, turned."""
+    one = method.predict(Observation(points=points))
+    other = method.predict(Observation(points=points @ rotation.mT))
+    assert one.camera_T_part is not None
+    assert other.camera_T_part is not None
+    assert one.joints is not None
+    assert other.joints is not None
+    assert_close(other.part_weight, one.part_weight, atol=1e-4, rtol=0)
+    turned = one.camera_T_part.clone()
+    turned[..., :3, :] = rotation @ turned[..., :3, :]
+    assert_close(other.camera_T_part, turned, atol=1e-3, rtol=0)
+    assert_close(other.joints.pivot, one.joints.pivot @ rotation.mT, atol=1e-3, rtol=0)
+    assert_close(other.joints.axis, one.joints.axis @ rotation.mT, atol=1e-3, rtol=0)
+    assert_close(other.joints.state, one.joints.state, atol=1e-4, rtol=0)
 
 
 POINTS = 160

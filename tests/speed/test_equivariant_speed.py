@@ -16,16 +16,10 @@ from scapo.equivariant.epn import PointConv
 from scapo.equivariant.layers import rows
 from scapo.equivariant.levels import SIGMA, Neighbourhood, kernel_points, neighbourhood
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 BATCH, POINTS, CENTRES, NEAR, CHANNELS = 2, 256, 128, 16, 16
 RADIUS = 0.15
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def data(anchors: int) -> tuple[Tensor, Neighbourhood, Tensor]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,16 +13,10 @@ from torch import Tensor
 from scapo.export.network import export_network, write_onnx
 from scapo.registered.view_network import PlainViewVotes, ViewNetwork
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 CLOUDS, POINTS = 1, 1024
 """One cloud, as `fast` asks."""
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -7,10 +7,8 @@ Clouds per second are one over the median, or over `processor seconds` (means) o
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 
 import pytest
-import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch import Tensor
 
@@ -19,15 +17,9 @@ from scapo.method import Mode
 from scapo.released import released
 from sim_assets import generate_samples
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 ROUNDS: dict[Mode, int] = {"fast": 20, "quick": 10, "refine": 5}
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module", params=sorted(released()))

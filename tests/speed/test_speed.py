@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -17,16 +17,10 @@ from scapo.paper.autoencoder import Encoder, EncoderConfig
 from scapo.paper.skinning import Bones
 from scapo.paper.vector_neurons import VNBlock
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 BATCH, POINTS, PARTS = 8, 1024, 2
 SAMPLES = 64
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture

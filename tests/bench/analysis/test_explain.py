@@ -23,6 +23,7 @@ from bench.statistics import Interval
 from scapo.store import StoreError, open_split
 from scapo.store.predictions import write_predictions
 from tests.helpers import made
+from tests.helpers.scoring import root
 
 CATEGORIES = ("laptop", "eyeglasses", "drawer")
 
@@ -30,10 +31,6 @@ CATEGORIES = ("laptop", "eyeglasses", "drawer")
 @pytest.fixture(scope="module", params=CATEGORIES)
 def split(request, tmp_path_factory):
     return made.make_data(tmp_path_factory.mktemp("data"), request.param, count=12, points=40)
-
-
-def root(split):
-    return split.folder.parent.parent
 
 
 def ladder(split, arrays, folder):

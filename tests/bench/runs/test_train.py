@@ -28,38 +28,12 @@ from scapo.store.predictions import Predictions, read_prediction_header
 from scapo.store.samples import SampleDataset
 from scapo.store.schema import StoreError
 from scapo.types import Prediction
-from tests.helpers.hinged import plates
-from tests.helpers.small import FLAGS
-from tests.helpers.splits import write_split
-
-SMALL = [
-    "--preset", "cpu", "--epochs", "1", "--batch", "4",
-    "--encoder.centres", "16", "--encoder.neighbours", "6", "--encoder.width", "6",
-    "--decoder.points", "64", "--decoder.widths", "16", "16", "8",
-]  # fmt: skip
+from tests.helpers.small import FLAGS, POINTS, hinged_data
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two splits of plates in the layout of a split."""
-    folder = tmp_path_factory.mktemp("data")
-    for split, count in (("train", 12), ("test", 5)):
-        observation, labels = plates(count, 64, seed=count)
-        assert labels.camera_T_part is not None
-        assert labels.joints is not None
-        assert labels.part is not None
-        change = {
-            "points": observation.points.numpy(),
-            "part": labels.part.numpy().astype(np.uint8),
-            "camera_T_part": labels.camera_T_part.numpy(),
-            "joint_pivot": labels.joints.pivot.numpy(),
-            "joint_axis": labels.joints.axis.numpy(),
-            "joint_state": labels.joints.state.numpy(),
-        }
-        write_split(
-            folder / "laptop" / split, split=split, counts=(count,), change=change, points=64
-        )
-    return folder
+    return hinged_data(tmp_path_factory.mktemp("data"))
 
 
 def command(*words: object) -> None:
@@ -70,7 +44,7 @@ def command(*words: object) -> None:
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "scapo"
     command("train", "scapo", "--category", "laptop", "--data", data, "--out", out, "--device",
-            "cpu", *SMALL)  # fmt: skip
+            "cpu", *FLAGS["scapo"])  # fmt: skip
     return out
 
 
@@ -89,7 +63,8 @@ def test_the_run_is_that_of_the_flags(run: Path) -> None:
 def test_the_flags_of_speed_reach_the_run(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     command("train", "scapo", "--category", "laptop", "--data", data, "--out", out, "--device",
-            "cpu", *SMALL, "--precision", "bfloat16", "--no-tf32", "--no-pictures")  # fmt: skip
+            "cpu", *FLAGS["scapo"],
+            "--precision", "bfloat16", "--no-tf32", "--no-pictures")  # fmt: skip
     training = read_header(out / "checkpoint.safetensors")["training"]
     assert training == {
         "precision": "bfloat16",
@@ -105,7 +80,7 @@ def test_the_flags_of_speed_reach_the_run(data: Path, tmp_path: Path) -> None:
 def test_resume_leaves_a_finished_run(run: Path, data: Path) -> None:
     before = (run / "checkpoint.safetensors").read_bytes()
     command("train", "scapo", "--category", "laptop", "--data", data, "--out", run, "--device",
-            "cpu", *SMALL, "--resume")  # fmt: skip
+            "cpu", *FLAGS["scapo"], "--resume")  # fmt: skip
     assert (run / "checkpoint.safetensors").read_bytes() == before
 
 
@@ -116,7 +91,7 @@ def test_predictions_are_those_that_evaluate_reads(run: Path, data: Path, tmp_pa
     with Predictions(out, split) as predictions:
         rows = predictions.rows(0, 5)
         predictions.finish()
-    assert rows["part_weight"].shape == (5, 64, 2)
+    assert rows["part_weight"].shape == (5, POINTS, 2)
     header = read_prediction_header(out)
     assert (header.method, header.variant, header.supervision) == ("scapo", "cpu", ())
     assert header.data_digest == split.manifest.digest

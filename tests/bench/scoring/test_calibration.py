@@ -18,19 +18,6 @@ from scapo.store.predictions import write_predictions
 from tests.helpers import made
 from tests.helpers.scoring import root, score
 
-CATEGORIES = ("laptop", "eyeglasses", "drawer")
-
-
-@pytest.fixture(scope="module", params=CATEGORIES)
-def split(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp(request.param)
-    return made.make_data(folder, request.param, count=11, train=30, points=48, background=4)
-
-
-@pytest.fixture(scope="module")
-def laptop(tmp_path_factory):
-    return made.make_data(tmp_path_factory.mktemp("data"), "laptop", count=11, train=30, points=48)
-
 
 def own_frames(split, seed):
     """The truth in hidden canonical frames and states, parts swapped in some samples where the

@@ -3,35 +3,22 @@
 
 from __future__ import annotations
 
-import copy
-import subprocess
-import sys
-from collections.abc import Callable
-
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.testing import assert_close
 
-from scapo.equivariant.anchors import icosahedron, turned
-from scapo.equivariant.e2pn import ORBITS, QuotientBlock, QuotientConv, orbits, to_rotations
-from scapo.equivariant.epn import SeparableBlock
+from scapo.equivariant.anchors import icosahedron
+from scapo.equivariant.e2pn import ORBITS, QuotientConv, orbits, to_rotations
 from scapo.equivariant.levels import (
     SIGMA,
-    LevelConfig,
     Neighbourhood,
     kernel_points,
-    levels,
     neighbourhood,
 )
-from scapo.records import map_tensors
 from tests.helpers.strategies import normal
 
 GROUP = icosahedron()
-LAYERS = (
-    LevelConfig(radius=1.0, neighbours=8, stride=2),
-    LevelConfig(radius=1.6, neighbours=8, stride=2),
-)
 
 
 def test_orbits_share_what_the_turns_about_a_vertex_cannot_tell_apart() -> None:
@@ -75,32 +62,6 @@ def test_the_convolution_is_its_sum(anchors: int) -> None:
     assert_close(conv(features, near), naive(conv, features, points, near))
 
 
-def network(points: Tensor, blocks: list[QuotientBlock]) -> Tensor:
-    near, _ = levels(points, LAYERS)
-    features = torch.ones(*points.shape[:2], 1, 1)
-    for block, one in zip(blocks, near, strict=True):
-        features = block(features, one)
-    return features
-
-
-def test_a_network_turns_with_its_cloud_by_all_sixty() -> None:
-    blocks = [QuotientBlock(1, 8, slope=0.1), QuotientBlock(8, 8)]
-    points = normal(3, 2, 64, 3, dtype=torch.float32)
-    with torch.no_grad():
-        for _ in range(20):
-            network(points, blocks)  # batch statistics
-        for block in blocks:
-            block.eval()
-        out = network(points, blocks)
-        lifted = to_rotations(out)
-        assert (out.amax(2) - out.amin(2)).max() > 0.1  # anchors differ
-        for g in range(60):
-            moved = network(points @ GROUP.rotations[g].float().mT + 1, blocks)
-            assert_close(moved[:, :, turned(g, 12)], out, atol=1e-4, rtol=0)
-            assert_close(moved.amax(2), out.amax(2), atol=1e-4, rtol=0)
-            assert_close(to_rotations(moved)[:, :, turned(g, 60)], lifted, atol=1e-4, rtol=0)
-
-
 def test_rotations_see_the_vertices_in_their_own_order() -> None:
     seen = to_rotations(GROUP.vertices).view(60, 12, 3)
     for a in range(60):
@@ -113,57 +74,3 @@ def test_gradients_are_the_numerical_ones() -> None:
     conv = QuotientConv(1, 1).double()
     features = normal(5, 1, 5, 12, 1).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: conv(x, near), (features,))
-
-
-def test_recomputed_correlations_change_no_gradient() -> None:
-    near = neighbourhood(normal(0, 2, 12, 3), torch.tensor([[0, 5], [3, 1]]), 1.4, 3)
-    kept, features = QuotientConv(2, 3).double(), normal(6, 2, 12, 12, 2)
-    again = copy.deepcopy(kept)
-    again.recompute = True
-    found = []
-    for conv in (kept, again):
-        x = features.clone().requires_grad_()
-        conv(x, near).square().sum().backward()
-        assert conv.linear.weight.grad is not None
-        found.append((x.grad, conv.linear.weight.grad))
-    assert_close(found[0], found[1])
-
-
-@pytest.mark.parametrize(("kind", "anchors"), [(SeparableBlock, 60), (QuotientBlock, 12)])
-def test_blocks_ask_no_tensor_for_its_values(
-    kind: Callable[[int, int], nn.Module], anchors: int
-) -> None:
-    """Which would cut a compiler's graph in two: these have none to tell."""
-    near = neighbourhood(normal(0, 1, 9, 3).float(), torch.tensor([[0, 5]]), 1.4, 4)
-    block = kind(2, 3).to("meta")
-    x = torch.zeros(1, 9, anchors, 2, device="meta", requires_grad=True)
-    out = block(x, map_tensors(near, lambda one: one.to("meta")))
-    out.square().sum().backward()
-    assert out.shape == (1, 2, anchors, 3)
-    assert x.grad is not None
-    assert (out.is_meta, x.grad.is_meta) == (True, True)
-
-
-@pytest.mark.slow
-def test_blocks_compile_into_one_graph() -> None:
-    """In a process of its own, without shape checks; the compiler's front alone, which is quick."""
-    program = """
-import torch
-from scapo.equivariant.e2pn import QuotientBlock
-from scapo.equivariant.epn import SeparableBlock
-from scapo.equivariant.levels import neighbourhood
-
-points = torch.randn(1, 9, 3)
-near = neighbourhood(points, torch.tensor([[0, 5]]), 1.4, 4)
-for block, anchors in ((SeparableBlock(2, 3), 60), (QuotientBlock(2, 3), 12)):
-    found, start = [], torch.randn(1, 9, anchors, 2)
-    for forward in (block, torch.compile(block, backend="aot_eager", fullgraph=True)):
-        x = start.clone().requires_grad_()
-        forward(x, near).square().sum().backward()
-        found.append(x.grad)
-    torch.testing.assert_close(*found)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr

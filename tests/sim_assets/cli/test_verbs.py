@@ -20,7 +20,6 @@ from rich.console import Console
 
 from scapo.categories import CATEGORIES
 from scapo.store import open_split, write_bytes
-from sim_assets.__main__ import main
 from sim_assets.cli import verbs
 from sim_assets.cli.verbs import VERBS, Benchmark
 from sim_assets.generation import benchmark
@@ -30,14 +29,7 @@ from sim_assets.inspect.preview import draw_preview
 from tests.helpers import boxes, foreign
 from tests.helpers.foreign import light_set, write_pt
 from tests.helpers.odd_names import NAME
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    code = ended.value.code
-    assert isinstance(code, int)
-    return code
+from tests.helpers.programs import run
 
 
 @pytest.fixture(scope="module")

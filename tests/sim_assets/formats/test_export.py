@@ -15,19 +15,12 @@ import numpy as np
 import pytest
 from safetensors import safe_open
 
-from sim_assets.__main__ import main
 from sim_assets.formats.export import ExportFormat, export
 from tests.helpers.made import sample_arrays, write_split
+from tests.helpers.programs import run
 
 FORMATS = get_args(ExportFormat)
 SPLITS = ("clean/eyeglasses/test-ood", "clean/eyeglasses/train", "sensor/laptop/train")
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ import pytest
 from scapo.categories import CATEGORIES
 from scapo.parallel.pool import Pool
 from scapo.store import open_split
-from sim_assets.__main__ import main
 from sim_assets.generation import benchmark
 from sim_assets.generation.benchmark import (
     IDS,
@@ -27,8 +26,9 @@ from sim_assets.generation.benchmark import (
     read_record,
 )
 from sim_assets.generation.generate import Running
-from sim_assets.rendering.backends import resolve_backend
-from sim_assets.rendering.base import RenderError
+from tests.helpers.programs import run
+
+pytestmark = pytest.mark.usefixtures("raycast")
 
 TINY: benchmark.Sizes = {"train": (2, 4), "val": (1, 3), "test": (1, 2), "test-ood": (1, 2)}
 HERE = Running(workers=0)
@@ -36,21 +36,6 @@ HERE = Running(workers=0)
 
 def tiny(*only: str) -> Task:
     return Task(only=only, backend="raycast", sizes=TINY)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderer() -> None:
-    try:
-        resolve_backend("raycast")
-    except RenderError as error:
-        pytest.skip(str(error))
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 def test_all_of_contract_4_is_there():

@@ -17,21 +17,13 @@ from scapo.store import open_split
 from sim_assets.generation.generate import Made, Running, make_split
 from sim_assets.generation.ledger import GenerateError
 from sim_assets.options import DataOptions
-from sim_assets.rendering.backends import resolve_backend
-from sim_assets.rendering.base import RenderError
 
 OPTIONS = DataOptions(
     count=4, instances=2, points=256, image_size=96, backend="raycast", images=True
 )
+
+pytestmark = pytest.mark.usefixtures("raycast")
 MILLIMETRE = 0.001
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderer() -> None:
-    try:
-        resolve_backend("raycast")
-    except RenderError as error:
-        pytest.skip(str(error))
 
 
 def made(out: Path, options: DataOptions = OPTIONS) -> Made:

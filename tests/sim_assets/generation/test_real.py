@@ -12,30 +12,15 @@ import numpy as np
 import pytest
 
 from scapo.store import open_split
-from sim_assets.__main__ import main
 from sim_assets.describe.card import remake
 from sim_assets.generation.assets import recover
 from sim_assets.generation.benchmark import IDS, IDS_FORMAT, RECORD, pieces, read_record
 from sim_assets.generation.real import KINDS, category_of, real_models
 from sim_assets.models.validate import AssetError
-from sim_assets.rendering.backends import resolve_backend
-from sim_assets.rendering.base import RenderError
+from tests.helpers.programs import run
 from tests.helpers.urdfs import cabinet
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderer() -> None:
-    try:
-        resolve_backend("raycast")
-    except RenderError as error:
-        pytest.skip(str(error))
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
+pytestmark = pytest.mark.usefixtures("raycast")
 
 
 def found(path: Path) -> dict[str, list[str]]:

@@ -14,19 +14,11 @@ from sim_assets.generation.generate import Running, generate
 from sim_assets.generation.request import make_request
 from sim_assets.generation.shard import make_renderer
 from sim_assets.options import DataOptions
-from sim_assets.rendering.backends import resolve_backend
-from sim_assets.rendering.base import RenderError
 from sim_assets.sampling.samples import Row, SampleMaker
 
+pytestmark = pytest.mark.usefixtures("raycast")
+
 SMALL = DataOptions(count=6, instances=1, backend="raycast", points=512, image_size=160)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _renderer() -> None:
-    try:
-        resolve_backend("raycast")
-    except RenderError as error:
-        pytest.skip(str(error))
 
 
 def rows(category: str, options: DataOptions, views: range | None = None) -> list[Row]:

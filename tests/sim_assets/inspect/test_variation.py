@@ -10,19 +10,12 @@ import numpy as np
 import pytest
 
 from scapo.store import Split, open_split, write_bytes
-from sim_assets.__main__ import main
 from sim_assets.inspect.variation import Variation
 from sim_assets.procedural import generate as make
+from tests.helpers.programs import run
 from tests.helpers.urdfs import cabinet
 
 FLAT = ("--protocol", "full", "--points", 64, "--workers", 0)
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 @pytest.fixture(scope="module")

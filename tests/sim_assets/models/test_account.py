@@ -9,23 +9,16 @@ import numpy as np
 import pytest
 
 from scapo.store import open_split
-from sim_assets.__main__ import main
 from sim_assets.generation.assets import UrdfAsset, recover
 from sim_assets.inspect.check import Options, check, check_one
 from sim_assets.models.account import check_speaks, sentences
 from sim_assets.models.reader import read
 from sim_assets.models.validate import AssetError
 from sim_assets.procedural import generate as make
+from tests.helpers.programs import run
 from tests.helpers.urdfs import cabinet
 
 FLAT = ("--protocol", "full", "--points", 64, "--workers", 0, "--count", 4)
-
-
-def run(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
 
 
 def flap(folder: Path) -> Path:
