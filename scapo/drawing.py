@@ -23,7 +23,7 @@ def draw_cloud(
     """Points of the camera frame in perspective, far ones first, coloured by part (-1 grey)."""
     order = np.argsort(-points[:, 2])
     palette = np.array([*PART_COLORS, BACKGROUND])
-    flat = _project(points[order])
+    flat = project(points[order])
     axes.scatter(
         flat[:, 0], flat[:, 1], s=size, c=palette[part[order]], linewidths=0, rasterized=True
     )
@@ -52,11 +52,12 @@ def draw_axis(
     ends = pivot + direction * np.array([[middle - reach], [middle + reach]])
     if (ends[:, 2] <= 0).any():
         return
-    flat = _project(ends)
+    flat = project(ends)
     style = (0, (3, 2)) if dashed else "solid"
     axes.plot(flat[:, 0], flat[:, 1], color="white", linewidth=3.2, solid_capstyle="round")
     axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=1.6, linestyle=style)
 
 
-def _project(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
+def project(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
+    """Image points of the camera frame."""
     return points[:, :2] / points[:, 2:]

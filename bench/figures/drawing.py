@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 
-from scapo.drawing import BACKGROUND, PART_COLORS
+from scapo.drawing import BACKGROUND, PART_COLORS, project
 from scapo.store import write_bytes
 from scapo.text import one_line
 
@@ -42,16 +42,6 @@ def look(azimuth: float, elevation: float) -> Float[np.ndarray, "4 4"]:
     pose[:3, :3] = np.stack([right, np.cross(-away, right), -away])
     pose[:3, 3] = [0, 0, DISTANCE]
     return pose
-
-
-def transform(pose: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*N 3"]) -> np.ndarray:
-    """Points of the right frame of `a_T_b` in the left one."""
-    return points @ pose[:3, :3].T + pose[:3, 3]
-
-
-def project(points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
-    """Image points of the camera frame."""
-    return points[:, :2] / points[:, 2:]
 
 
 def draw_points(

@@ -20,9 +20,9 @@ from bench.figures.drawing import (
     part_legend,
     plain,
     save,
-    transform,
     window,
 )
+from scapo.geometry.matrices import moved
 
 VIEWS = {"from the front, above": (35.0, 28.0), "from the side": (90.0, 0.0),
          "from above": (0.0, 89.9)}  # fmt: skip
@@ -92,9 +92,9 @@ def canonical(
     points, places, directions = [], [], []
     for i in samples:
         base_T_camera = np.linalg.inv(pieces.pose[i, 0])
-        cloud = transform(base_T_camera, answered.points[i, ::stride]) / answered.scale[i]
+        cloud = moved(answered.points[i, ::stride], base_T_camera) / answered.scale[i]
         axis = pieces.axis[i] @ base_T_camera[:3, :3].T
-        pivot = transform(base_T_camera, pieces.pivot[i]) / answered.scale[i]
+        pivot = moved(pieces.pivot[i], base_T_camera) / answered.scale[i]
         points.append(cloud)
         # The axis beside the cloud, wherever along it the pivot was put.
         places.append(pivot + axis * ((cloud.mean(0) - pivot) * axis).sum(-1, keepdims=True))
@@ -110,10 +110,8 @@ def canonical(
 
 def _panel(axes: Axes, shape: Shape, camera: np.ndarray, half: float) -> None:
     points, part, places, directions = shape
-    draw_points(axes, transform(camera, points), PALETTE[part], size=1.3, alpha=0.6)
-    for place, direction in zip(
-        transform(camera, places), directions @ camera[:3, :3].T, strict=True
-    ):
+    draw_points(axes, moved(points, camera), PALETTE[part], size=1.3, alpha=0.6)
+    for place, direction in zip(moved(places, camera), directions @ camera[:3, :3].T, strict=True):
         if np.isfinite(place).all() and np.isfinite(direction).all():
             draw_line(axes, place, direction, reach=0.45, width=0.8, alpha=0.5)
     window(axes, half)

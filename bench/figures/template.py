@@ -26,12 +26,12 @@ from bench.figures.drawing import (
     part_legend,
     plain,
     save,
-    transform,
     window,
 )
 from scapo.alignment import Alignment
 from scapo.categories import Category
 from scapo.geometry import rigid as geometry
+from scapo.geometry.matrices import moved
 from scapo.method import AbstractMethod
 from scapo.types import Joints, Prediction
 
@@ -152,7 +152,7 @@ def at_states(
             "revolute" if turns else "prismatic",
         ).numpy()
         share = shape.weight[:, joint + 1 : joint + 2]
-        points = points + share * (shape.points @ motion[:3, :3].T + motion[:3, 3])
+        points = points + share * moved(shape.points, motion)
         if normals is not None and shape.normals is not None:
             normals = normals + share * (shape.normals @ motion[:3, :3].T)
     return replace(shape, points=points, normals=normals)
@@ -240,7 +240,7 @@ def _state_text(value: Float[np.ndarray, " J"], revolute: np.ndarray) -> str:
 
 
 def _panel(axes: Axes, shape: TemplateShape, camera: np.ndarray, half: float) -> None:
-    points, turn = transform(camera, shape.points), camera[:3, :3]
+    points, turn = moved(shape.points, camera), camera[:3, :3]
     color = shape.weight @ PALETTE[: shape.weight.shape[1]]
     if shape.normals is not None:
         length = np.maximum(np.linalg.norm(shape.normals, axis=1, keepdims=True), 1e-9)
@@ -250,5 +250,5 @@ def _panel(axes: Axes, shape: TemplateShape, camera: np.ndarray, half: float) ->
     reach = 0.55 * half
     for pivot, axis in zip(shape.pivot, shape.axis, strict=True):
         place = pivot + axis * ((shape.points.mean(0) - pivot) @ axis)
-        draw_line(axes, transform(camera, place), axis @ turn.T, reach=reach)
+        draw_line(axes, moved(place, camera), axis @ turn.T, reach=reach)
     window(axes, half)

@@ -22,6 +22,7 @@ from bench.twin.surface import Samples, closed_mesh, joined, seen_samples
 from scapo.categories import JointKind
 from scapo.drawing import PART_COLORS
 from scapo.export.urdf import DENSITY, RGBA, Inertia, Joint, Link, Surface
+from scapo.geometry.matrices import moved
 
 LEAST_MASS = 1e-3
 """kg."""
@@ -54,7 +55,7 @@ def articulated(twin: Twin) -> Articulated:
             kind=spec.kind,
             parent=names[spec.parent],
             child=names[spec.child],
-            pivot=apply(root_T_camera[spec.child], twin.pivot[j].astype(float)),
+            pivot=moved(twin.pivot[j].astype(float), root_T_camera[spec.child]),
             axis=_unit(root_T_camera[spec.child][:3, :3] @ twin.axis[j]),
             lower=float(twin.limits[j, 0]),
             upper=float(twin.limits[j, 1]),
@@ -98,13 +99,6 @@ def motion(
     return made
 
 
-def apply(
-    a_T_b: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*N 3"]
-) -> Float[np.ndarray, "*N 3"]:
-    """Points of b in a."""
-    return points @ a_T_b[:3, :3].T + a_T_b[:3, 3]
-
-
 def _unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
     return vector.astype(float) / np.linalg.norm(vector)
 
@@ -135,11 +129,11 @@ def _samples(twin: Twin, part: int, root_T_camera: Float[np.ndarray, "4 4"]) -> 
     model = seen = none
     own = twin.part == part
     if own.any():
-        points = apply(root_T_camera, twin.points[own].astype(float))
+        points = moved(twin.points[own].astype(float), root_T_camera)
         seen = seen_samples(points, root_T_camera[:3, 3])
     if twin.shape is not None and (own := twin.shape.part == part).any():
         model = Samples(
-            points=apply(root_T_camera, twin.shape.points[own].astype(float)),
+            points=moved(twin.shape.points[own].astype(float), root_T_camera),
             normals=twin.shape.normals[own].astype(float) @ root_T_camera[:3, :3].T,
         )
     return joined(model, seen)

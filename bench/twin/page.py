@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from bench.twin.articulated import Articulated, apply, articulated, root_from_camera
+from bench.twin.articulated import Articulated, articulated, root_from_camera
 from bench.twin.record import BACKGROUND, Twin
 from scapo.drawing import BACKGROUND as BACKGROUND_COLOR
 from scapo.drawing import PART_COLORS
+from scapo.geometry.matrices import moved
 from scapo.store import write_bytes
 
 MAX_POINTS = 2_000
@@ -238,7 +239,7 @@ def _part(twin: Twin, made: Articulated, part: int) -> dict[str, Any]:
     shown: dict[str, Any] = {"color": _rgb(part)}
     for surface in made.links[part].surfaces:
         camera_T_root = np.linalg.inv(root_from_camera(twin)[part])
-        shown["vertices"] = _packed(apply(camera_T_root, surface.vertices), np.float32)
+        shown["vertices"] = _packed(moved(surface.vertices, camera_T_root), np.float32)
         shown["faces"] = _packed(surface.faces, np.uint32)
     return shown
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether matrices from outside are rotations and rigid motions, by numpy alone."""
+"""Rigid motions by numpy alone: of points, and whether matrices from outside are any."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ from jaxtyping import Bool, Float
 
 MIRRORED = 2.0
 """What `rotation_error` says of a mirror, as far from any rotation as an orthogonal matrix is."""
+
+
+def moved(
+    points: Float[np.ndarray, "*N 3"], a_T_b: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "*N 3"]:
+    """Coordinates in a of points in b."""
+    return points @ a_T_b[:3, :3].T + a_T_b[:3, 3]
 
 
 def rotation_error(matrix: Float[np.ndarray, "*B 3 3"]) -> Float[np.ndarray, "*B"]:

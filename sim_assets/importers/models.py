@@ -20,8 +20,9 @@ from jaxtyping import Float
 
 from scapo.categories import CATEGORIES, Category
 from scapo.export.urdf import Joint, Link, Surface
+from scapo.geometry.matrices import moved
 from sim_assets.importers.records import Mesh, Vector
-from sim_assets.models.joints import hull_area, hull_points, moved
+from sim_assets.models.joints import hull_area, hull_points
 from sim_assets.models.validate import refuse
 from sim_assets.objects import joint_motion
 

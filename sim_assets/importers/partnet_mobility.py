@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from scapo.export.urdf import Joint, Link, Surface
+from scapo.geometry.matrices import moved
 from sim_assets.importers.models import Folder, Model, our_category, safe_word
 from sim_assets.importers.records import read_json
-from sim_assets.models.joints import moved
 from sim_assets.models.library import find as find_urdfs
 from sim_assets.models.reader import Model as ReadModel
 from sim_assets.models.reader import load

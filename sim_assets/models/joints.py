@@ -38,6 +38,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from scapo.categories import Category, JointSpec
+from scapo.geometry.matrices import moved
 from sim_assets.models.robot import Joint, Robot
 from sim_assets.models.sources import Traits
 from sim_assets.models.validate import AssetError, check_movable, kinds, refuse
@@ -210,13 +211,6 @@ def words(*names: str) -> set[str]:
     found = re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", " ".join(names))
     lower = {word.lower() for word in found}
     return {word[:-1] if len(word) > 3 and word.endswith("s") else word for word in lower} - {""}
-
-
-def moved(
-    points: Float[np.ndarray, "N 3"], a_T_b: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "N 3"]:
-    """Coordinates in a of points in b."""
-    return points @ a_T_b[:3, :3].T + a_T_b[:3, 3]
 
 
 def diagonal(surfaces: Surfaces, poses: Mapping[str, Float[np.ndarray, "4 4"]]) -> float:

@@ -19,6 +19,7 @@ import trimesh
 from jaxtyping import Float, Int
 from trimesh.visual import ColorVisuals, TextureVisuals
 
+from scapo.geometry.matrices import moved
 from sim_assets.models.resolver import MeshResolver, SourceFiles
 from sim_assets.models.robot import Color, Robot, Shape, ShapeKind
 from sim_assets.models.sides import two_sided, used_vertices
@@ -211,14 +212,13 @@ def _placed(piece: Visual, shape: Shape, files: SourceFiles, where: str) -> Visu
         if np.prod(shape.size) < 0:
             files.repairs.add("A mirrored mesh was wound anew", where)
             faces = faces[:, ::-1]
-    pose = shape.link_T_shape
-    moved = vertices @ pose[:3, :3].T + pose[:3, 3]
+    placed = moved(vertices, shape.link_T_shape)
     used = used_vertices(faces)
-    if not (np.abs(moved[used]) <= MAX_COORDINATE).all():
+    if not (np.abs(placed[used]) <= MAX_COORDINATE).all():
         raise refuse(files.urdf, f"{where}: coordinates below {MAX_COORDINATE:g}", "larger ones")
-    if not np.ptp(moved[used], axis=0).max() > MIN_SIZE:
+    if not np.ptp(placed[used], axis=0).max() > MIN_SIZE:
         raise refuse(files.urdf, f"{where}: a shape larger than {MIN_SIZE:g}", "a smaller one")
-    mesh = remade(piece.mesh, moved, faces)
+    mesh = remade(piece.mesh, placed, faces)
     if shape.color is None:
         return Visual(mesh=mesh, color=piece.color)
     mesh.visual = ColorVisuals()  # the URDF's colour stands in for the file's material

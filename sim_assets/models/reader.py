@@ -21,6 +21,7 @@ from trimesh.visual import TextureVisuals
 
 from scapo.categories import Category
 from scapo.categories import category as find_category
+from scapo.geometry.matrices import moved
 from sim_assets.models import frames
 from sim_assets.models.account import account
 from sim_assets.models.frames import Vector
@@ -30,7 +31,6 @@ from sim_assets.models.joints import (
     Surfaces,
     exchanged,
     find_rest,
-    moved,
     reduce,
     reordered,
 )

@@ -14,6 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float, Int
 
 from scapo.geometry.camera import Intrinsics
+from scapo.geometry.matrices import moved
 from sim_assets.models.textures import Paint
 from sim_assets.objects import ArticulatedObject
 from sim_assets.rendering.base import BACKGROUND, AbstractRenderer, Frame, RenderError, pixel_rays
@@ -58,7 +59,7 @@ class RaycastRenderer(AbstractRenderer):
             raise RenderError("expected an open object, found none")
         poses = camera_T_object @ self.object.pose(state)
         parts = range(len(poses)) if only is None else (only,)
-        in_camera = {p: _move(self.vertices[p], poses[p]) for p in parts}
+        in_camera = {p: moved(self.vertices[p], poses[p]) for p in parts}
         pixels, rays = _rays(camera, np.concatenate(list(in_camera.values())))
         cast = self._cast_parts if self.large else self._cast_merged
         depth, part, face = cast(poses, in_camera, rays)
@@ -73,7 +74,7 @@ class RaycastRenderer(AbstractRenderer):
         for p, paint in enumerate(self.paints):
             seen = np.flatnonzero(part == p)
             part_T_camera = np.linalg.inv(poses[p])
-            surface = _move(rays[seen] * depth[seen, None], part_T_camera)
+            surface = moved(rays[seen] * depth[seen, None], part_T_camera)
             inward = surface - part_T_camera[:3, 3]
             color.reshape(-1, 3)[pixels[seen]] = paint.colors(face[seen], surface, inward)
         return Frame(depth=image, part=label, color=color)
@@ -130,10 +131,6 @@ def _embree(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -
     scene = EmbreeScene(robust=True)  # no ray slips between two neighbouring triangles
     TriangleMesh(scene, vertices.astype(np.float32), faces)
     return scene
-
-
-def _move(points: Float[np.ndarray, "V 3"], a_T_b: Float[np.ndarray, "4 4"]) -> np.ndarray:
-    return points @ a_T_b[:3, :3].T + a_T_b[:3, 3]
 
 
 def _plane_depth(

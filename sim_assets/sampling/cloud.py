@@ -14,6 +14,7 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 
 from scapo.geometry.camera import Intrinsics
+from scapo.geometry.matrices import moved
 from sim_assets.models.textures import Paint
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import Sampling
@@ -227,7 +228,7 @@ class SurfaceSamples:
         points, colors = [], []
         for p, (mesh, pose, n) in enumerate(zip(self.meshes, camera_T_part, number, strict=True)):
             drawn, face = sample_surface(mesh, int(n), rng)
-            points.append(drawn @ pose[:3, :3].T + pose[:3, 3])
+            points.append(moved(drawn, pose))
             if self.paints:
                 colors.append(self.paints[p].colors(face, drawn))
         part = np.repeat(np.arange(len(number), dtype=np.uint8), number)

@@ -16,6 +16,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.optimize import linear_sum_assignment
 
 from scapo.geometry.camera import Intrinsics
+from scapo.geometry.matrices import moved
 from sim_assets.options import Noise
 from sim_assets.rendering.base import BACKGROUND, AbstractRenderer
 from sim_assets.sampling.turned_fit import CLOSE, NEAR, Body, Fit, Oriented
@@ -159,7 +160,7 @@ class DepthImage(AbstractEvidence):
         first = minimum_filter(depth, 2 * reach + 1, mode="nearest") - near
         shares = []
         for points in self.body.posed(starts, count):
-            x, y, z = np.moveaxis(points @ pose[:3, :3].T + pose[:3, 3], -1, 0)
+            x, y, z = np.moveaxis(moved(points, pose), -1, 0)
             ahead = np.maximum(z, 1e-6)
             u = np.floor(x / ahead * camera.fx + camera.cx).astype(np.intp)
             v = np.floor(y / ahead * camera.fy + camera.cy).astype(np.intp)
@@ -215,7 +216,7 @@ def _close_up(
     """Intrinsics of the part of the image that shows the object, at the resolution compared."""
     poses = camera_T_object @ body.thing.pose(state)
     surfaces = zip(body.surfaces, poses, strict=True)
-    points = np.concatenate([s[:, :3] @ pose[:3, :3].T + pose[:3, 3] for s, pose in surfaces])
+    points = np.concatenate([moved(s[:, :3], pose) for s, pose in surfaces])
     camera, z = sight.camera, np.maximum(points[:, 2], 1e-6)
     size = np.array([camera.width, camera.height])
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
@@ -280,9 +281,7 @@ class WholeSurface(AbstractEvidence):
         out = []
         for drawn, pose in zip(self.drawn, poses, strict=True):
             points, normals = np.split(drawn, 2, axis=1)
-            out.append(
-                np.concatenate([points @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T], 1)
-            )
+            out.append(np.concatenate([moved(points, pose), normals @ pose[:3, :3].T], 1))
         return np.concatenate(out)
 
     def _open(self, seen: Oriented, fit: Fit) -> tuple[float, Int[np.ndarray, " M"]]:

@@ -27,6 +27,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scapo.categories import Window
 from scapo.geometry.camera import Intrinsics
+from scapo.geometry.matrices import moved
 from sim_assets.models.joints import farthest
 from sim_assets.objects import ArticulatedObject
 from sim_assets.options import PresetName, Protocol
@@ -94,14 +95,11 @@ class Outline:
 
     def posed(self, states: Float[np.ndarray, "K J"]) -> Float[np.ndarray, "V 3"]:
         """The outline points in the object frame at all of these states together."""
-        moved = [self.parts[0]]
+        found = [self.parts[0]]
         for state in states:
             poses = self.thing.pose(state)
-            moved += [
-                points @ pose[:3, :3].T + pose[:3, 3]
-                for points, pose in zip(self.parts[1:], poses[1:], strict=True)
-            ]
-        return np.concatenate(moved)
+            found += map(moved, self.parts[1:], poses[1:])
+        return np.concatenate(found)
 
 
 def hull_points(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "_ 3"]:

@@ -20,7 +20,6 @@ from bench.figures.drawing import (
     draw_points,
     look,
     project,
-    transform,
     window,
 )
 from bench.figures.overlay import canonical, overlay_picture
@@ -36,6 +35,7 @@ from bench.figures.template import (
 )
 from bench.requests import Request
 from scapo.categories import CATEGORIES, category
+from scapo.geometry.matrices import moved
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.template import Placement
@@ -62,11 +62,11 @@ def test_look_sees_the_front_upright_from_where_it_stands(azimuth, elevation) ->
     pose = look(azimuth, elevation)
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose) == pytest.approx(1)
-    assert transform(pose, np.zeros((1, 3)))[0].tolist() == [0, 0, DISTANCE]
+    assert moved(np.zeros((1, 3)), pose)[0].tolist() == [0, 0, DISTANCE]
     a, e = np.radians([azimuth, elevation])
     eye = DISTANCE * np.array([-np.cos(a) * np.cos(e), -np.sin(a) * np.cos(e), np.sin(e)])
-    np.testing.assert_allclose(transform(pose, eye[None]), 0, atol=1e-12)
-    up = transform(pose, np.array([[0, 0, 1.0]]))[0]
+    np.testing.assert_allclose(moved(eye[None], pose), 0, atol=1e-12)
+    up = moved(np.array([[0, 0, 1.0]]), pose)[0]
     assert up[0] == pytest.approx(0, abs=1e-12)
     assert up[1] < 0  # y is down
 
@@ -107,12 +107,12 @@ def test_the_truth_overlaid_is_in_the_object_frame_and_on_itself(tmp_path) -> No
     points, part, places, directions = mine
     truth = answered.split.arrays("camera_T_part", "points", "joint_axis", "joint_pivot")
     inverse = np.linalg.inv(truth["camera_T_part"][4, 0].astype(float))
-    expected = transform(inverse, truth["points"][4]) / answered.scale[4]
+    expected = moved(truth["points"][4], inverse) / answered.scale[4]
     np.testing.assert_allclose(points.reshape(9, -1, 3)[4], expected, atol=1e-5)
     np.testing.assert_allclose(
         directions[4], inverse[:3, :3] @ truth["joint_axis"][4, 0], atol=1e-5
     )
-    away = places[4] - transform(inverse, truth["joint_pivot"][4])[0] / answered.scale[4]
+    away = places[4] - moved(truth["joint_pivot"][4], inverse)[0] / answered.scale[4]
     assert np.linalg.norm(np.cross(away, directions[4])) < 1e-5
     assert abs((places[4] - expected.mean(0)) @ directions[4]) < 1e-5
     assert part.shape == (9 * 200,)
@@ -207,10 +207,10 @@ def test_a_template_in_the_objects_frame_moves_as_the_category_says() -> None:
     np.testing.assert_array_equal(found.weight, shape.weight[:, ::-1])
     for slot in (0, 1):  # a part's points at rest are those of its own frame, undone
         inverse = np.linalg.inv(np.array(own.own_T_part[own.order[slot]]))
-        expected = transform(inverse, shape.points[part == slot])
+        expected = moved(shape.points[part == slot], inverse)
         np.testing.assert_allclose(found.points[part == slot], expected, atol=1e-12)
     base = np.linalg.inv(np.array(own.own_T_part[0]))
-    np.testing.assert_allclose(found.pivot, transform(base, shape.pivot), atol=1e-12)
+    np.testing.assert_allclose(found.pivot, moved(shape.pivot, base), atol=1e-12)
     np.testing.assert_allclose(found.axis, own.sign[0] * shape.axis @ base[:3, :3].T, atol=1e-12)
 
 
