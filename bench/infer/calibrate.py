@@ -25,7 +25,7 @@ from bench.infer.calibration import (
     write_calibration,
 )
 from bench.infer.cloud import Cloud
-from bench.infer.model import Model, load_model, weights_file
+from bench.infer.model import Model, load_model
 from bench.matching import rotation_degrees
 from bench.metrics import line_degrees
 from bench.requests import CalibrateRequest
@@ -37,6 +37,7 @@ from scapo.method import evenly
 from scapo.predictor import Predictor
 from scapo.released import find
 from scapo.store import Split, StoreError, open_split
+from scapo.store.checkpoint import weights_file
 from scapo.store.files import require_suffix
 
 FOLDS = 5

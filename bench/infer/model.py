@@ -12,7 +12,7 @@ from bench.requests import Mode
 from scapo.categories import Category
 from scapo.predictor import Predictor
 from scapo.released import find, released
-from scapo.store.checkpoint import WEIGHTS, check_header
+from scapo.store.checkpoint import WEIGHTS, check_header, weights_file
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
 from scapo.text import did_you_mean
@@ -61,11 +61,6 @@ def load_model(what: Path | str, device: str, mode: Mode | None) -> Model:
         digest=digest,
         calibration=known,
     )
-
-
-def weights_file(path: Path) -> Path:
-    """The checkpoint of a run folder, or the file itself."""
-    return path / WEIGHTS if path.is_dir() else path
 
 
 def load_models(run: Path | None, category: str | None, device: str, mode: Mode) -> list[Model]:

@@ -26,11 +26,11 @@ from scapo.predictor import Predictor
 from scapo.store import Header, StoreError, open_split, sha256_file, write, write_bytes
 from scapo.store.checkpoint import (
     RUN_FIELDS,
-    WEIGHTS,
     alignment_field,
     check_header,
     require_fields,
     to_arrays,
+    weights_file,
 )
 from scapo.store.files import read, require_suffix
 from scapo.store.samples import SampleDataset, observe, observed
@@ -114,7 +114,7 @@ def release(request: ReleaseRequest) -> list[Path]:
     require_fields(header, RUN_FIELDS, request.checkpoint)
     if not header["finished"]:
         raise StoreError(f"{request.checkpoint}: expected a finished run, found one that is not")
-    source = request.checkpoint / WEIGHTS if request.checkpoint.is_dir() else request.checkpoint
+    source = weights_file(request.checkpoint)
     if source.resolve() != request.out.resolve():
         header = {**header, **frame_of_before(method, header, request),
                   "config": without_folders(header["config"])}  # fmt: skip

@@ -30,7 +30,7 @@ from bench.requests import (
 from bench.runs.predict import Watch, predict
 from bench.runs.stability import measure_stability
 from scapo.store import StoreError
-from scapo.store.checkpoint import WEIGHTS
+from scapo.store.checkpoint import weights_file
 
 LONGEST_NAME = 150
 """Characters of a run's name in names of files, which may have 255 bytes."""
@@ -86,10 +86,6 @@ def _name(run: Path) -> tuple[str, bool]:
     return name[:LONGEST_NAME], "pose" not in method.supervision
 
 
-def _weights(run: Path) -> Path:
-    return run / WEIGHTS if run.is_dir() else run
-
-
 class _Study:
     """The files of one study."""
 
@@ -128,7 +124,7 @@ class _Study:
         asked = self.request
         out = asked.out / "stability" / f"{name}.json"
         request = StabilityRequest(
-            checkpoint=_weights(run), data=asked.data, out=out, split=asked.split,
+            checkpoint=weights_file(run), data=asked.data, out=out, split=asked.split,
             mode=asked.mode, samples=asked.samples, device=asked.device,
         )  # fmt: skip
         self._made(out, (request.checkpoint,), lambda: measure_stability(request))
@@ -136,7 +132,7 @@ class _Study:
     def _predict(self, run: Path, out: Path, mode: Mode, limit: int | None) -> None:
         asked = self.request
         request = PredictRequest(
-            checkpoint=_weights(run), data=asked.data, out=out, mode=mode, limit=limit,
+            checkpoint=weights_file(run), data=asked.data, out=out, mode=mode, limit=limit,
             split=asked.split if limit is None else "train", device=asked.device,
         )  # fmt: skip
         self._made(out, (request.checkpoint,), lambda: predict(request, self.watch))

@@ -185,6 +185,11 @@ RUN_FIELDS = ("seed", "data_digest", "supervision", "steps", "finished", "versio
 """What the checkpoint of a run says beside what builds the method."""
 
 
+def weights_file(path: Path) -> Path:
+    """The checkpoint of a run folder, or the file itself."""
+    return path / WEIGHTS if path.is_dir() else path
+
+
 def read_checkpoint(path: Path) -> tuple[Arrays, Header]:
     """Weights and header of a checkpoint or of the run folder that holds one.
 
@@ -192,7 +197,7 @@ def read_checkpoint(path: Path) -> tuple[Arrays, Header]:
         StoreError: None there, another format, or a header without what builds a method or with
             values of other types than those of `CheckpointHeader`.
     """
-    path = path / WEIGHTS if path.is_dir() else path
+    path = weights_file(path)
     if not path.exists():
         raise StoreError(
             f"{path}: expected a file, found none; `scapo-bench train METHOD --out RUN` makes one"
