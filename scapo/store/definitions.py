@@ -8,6 +8,7 @@ name says all.
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Mapping
@@ -127,20 +128,10 @@ def defined(fields: Mapping[str, Any], name: str, where: str) -> Category | None
         return CATEGORIES.get(name)
     # What was made here has tuples yet, what was read has lists.
     where = f"{where}: {DEFINITION}"
-    found = _checked(from_json(Category, _as_json(record), where), where)
+    found = _checked(from_json(Category, json.loads(json.dumps(record)), where), where)
     if found.name != name:
         raise StoreError(f"{where}: expected of {name!r}, found of {found.name!r}")
     return found
-
-
-def _as_json(value: object) -> object:
-    if isinstance(value, Mapping):
-        return {key: _as_json(item) for key, item in cast("Mapping[str, object]", value).items()}
-    return (
-        [_as_json(item) for item in cast("tuple[object, ...]", value)]
-        if isinstance(value, list | tuple)
-        else value
-    )
 
 
 def known_category(manifest: Manifest) -> Category | None:
