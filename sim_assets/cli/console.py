@@ -6,9 +6,9 @@ Names and reasons come from files of anybody: they are shown as they are, on one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import (
@@ -27,8 +27,6 @@ from scapo.text import one_line
 
 if TYPE_CHECKING:
     from sim_assets.generation.generate import Made
-
-Item = TypeVar("Item")
 
 
 def say(console: Console, line: object, *, label: str = "", style: str = "") -> None:
@@ -71,15 +69,6 @@ def progress_bar(console: Console) -> Iterator[Callable[[str, int, int], None]]:
             progress.update(bars[what], completed=done, total=total)
 
         yield show
-
-
-def watched(console: Console, what: str, items: Iterable[Item], total: int) -> Iterator[Item]:
-    """The items, with a bar."""
-    with progress_bar(console) as show:
-        show(what, 0, total)
-        for done, item in enumerate(items, 1):
-            yield item
-            show(what, done, total)
 
 
 def show_made(console: Console, made: Made, seconds: float) -> None:

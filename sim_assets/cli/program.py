@@ -10,10 +10,10 @@ from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
-from rich.text import Text
 
 from scapo.interrupt import exit_if_unheard, exit_interrupted
-from scapo.text import one_line, unknown_word
+from scapo.text import unknown_word
+from sim_assets.cli.console import say
 from sim_assets.cli.verbs import VERBS, UsageError
 
 DESCRIPTION = (
@@ -31,7 +31,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
     console, errors = Console(), Console(stderr=True)
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words == ["--version"]:
-        _say(console, f"scapo-data {version('scapo')}")
+        say(console, f"scapo-data {version('scapo')}")
         sys.exit(0)
     try:
         if words and not words[0].startswith("-") and words[0] not in VERBS:
@@ -45,17 +45,13 @@ def run(arguments: Sequence[str] | None = None) -> None:
         )
         sys.exit(command.run(console))
     except MemoryError as error:
-        _say(errors, f"scapo-data: expected enough memory, found: {error}")
+        say(errors, f"scapo-data: expected enough memory, found: {error}")
         sys.exit(1)
     except (ValueError, OSError, RuntimeError) as error:
         if isinstance(error, BrokenPipeError):
             exit_if_unheard()
-        _say(errors, f"scapo-data: {error}")
+        say(errors, f"scapo-data: {error}")
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:
-        _say(errors, "scapo-data: stopped; the same command takes it up where it was")
+        say(errors, "scapo-data: stopped; the same command takes it up where it was")
         exit_interrupted()
-
-
-def _say(console: Console, line: str) -> None:
-    console.print(Text(one_line(line)), soft_wrap=True)

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from scapo.categories import CATEGORIES, Category
 from scapo.text import did_you_mean
-from sim_assets.cli.console import progress_bar, say, say_each, show_made, watched
+from sim_assets.cli.console import progress_bar, say, say_each, show_made
 from sim_assets.options import DataOptions
 
 if TYPE_CHECKING:
@@ -87,8 +87,10 @@ class Build:
         paths = build(
             self.category, count=self.count, seed=self.seed, out=self.out, split=self.split
         )
-        written = list(watched(console, "assets", paths, self.count))
-        say(console, f"{len(written)} assets in {self.out / self.category}")
+        with progress_bar(console) as show:
+            for done, _ in enumerate(paths, 1):
+                show("assets", done, self.count)
+        say(console, f"{self.count} assets in {self.out / self.category}")
         return 0
 
 

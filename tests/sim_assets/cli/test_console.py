@@ -7,7 +7,7 @@ import io
 
 from rich.console import Console
 
-from sim_assets.cli.console import RateColumn, progress_bar, say, say_each, watched
+from sim_assets.cli.console import RateColumn, progress_bar, say, say_each
 from tests.helpers.odd_names import NAME
 
 
@@ -28,6 +28,5 @@ def test_progress_shows_on_a_terminal_only():
         with progress_bar(console) as show:
             show("samples", 0, 10)
             show("samples", 10, 10)
-        assert list(watched(console, "assets", "ab", 2)) == ["a", "b"]
         assert ("10/10" in stream.getvalue()) is terminal
     assert RateColumn().max_refresh is None
