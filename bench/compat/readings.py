@@ -4,8 +4,8 @@
 `opalign` follows the released OP-Align evaluation (commit f3323dd) including its defects: part
 translations are not rotated, the third part is the base seen through joint 1, prismatic states
 turn the part, and directions less than 0.81 degrees apart are still turned. `geometry="se3"` is
-the same procedure without the first three. `eap_*` are EAP's soft IoU, folded rotation and
-calibration (`compat_eap`). Formulas are written anew from their definitions, in float64.
+the same procedure without the first three. EAP's readings are in `eap`. Formulas are written anew
+from their definitions, in float64.
 """
 
 from __future__ import annotations
@@ -17,23 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from bench.compat.chain import Chain, inverse_chain, straight_chain
-from bench.compat.eap import eap_calibration, eap_iou, eap_rotation
 from bench.matching import nearest_orthogonal, project_rotations, rotation_degrees
 from bench.metrics import unit
 from scapo.geometry.part_order import order_scores, part_orders
 from scapo.store.predictions import RECORD
-
-__all__ = [
-    "SYMMETRY",
-    "Chain",
-    "consensus",
-    "eap_calibration",
-    "eap_iou",
-    "eap_rotation",
-    "opalign",
-    "score_record",
-    "standardise",
-]
 
 Geometry = Literal["compat", "se3"]
 

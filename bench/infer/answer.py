@@ -22,6 +22,7 @@ from bench.requests import Mode
 from bench.twin.record import BACKGROUND, Shape, Twin
 from scapo.categories import Category
 from scapo.geometry.points import normalise
+from scapo.records import take
 from scapo.registered.outliers import inlier_mask
 from scapo.registered.pose_refinement import BACKWARD, RANKED
 from scapo.registered.view_loss import view_loss
@@ -114,7 +115,9 @@ def agreement(cloud: Cloud, twin: Twin, model: Model, mode: Mode) -> Twin:
     draws = [cloud.points[rng.choice(len(cloud.points), count, replace=False)]
              for _ in range(RESAMPLES)]  # fmt: skip
     found = model.predictor.predict(np.stack(draws), mode, cloud.sensor, up=_up(cloud, model))
-    others = [_parts(twin.name, _row(found, k), model.category) for k in range(RESAMPLES)]
+    others = [
+        _parts(twin.name, take(found, torch.tensor(k)), model.category) for k in range(RESAMPLES)
+    ]
     poses = np.stack([one.camera_T_part[:, :3, :3] for one in others])
     turn = rotation_degrees(poses, np.broadcast_to(twin.camera_T_part[:, :3, :3], poses.shape))
     cosine = np.abs((np.stack([one.axis for one in others]) * twin.axis).sum(-1)).clip(0, 1)
@@ -154,12 +157,6 @@ def _draw(cloud: Cloud) -> _Drawn:
     points = cloud.points[index]
     inlier = inlier_mask(torch.as_tensor(points)[None])[0].numpy()
     return _Drawn(points=points, inlier=inlier)
-
-
-def _row(prediction: Prediction, index: int) -> Prediction:
-    from scapo.records import map_tensors
-
-    return map_tensors(prediction, lambda tensor: tensor[index])
 
 
 def _labels(found: Prediction) -> Int[np.ndarray, " K"]:

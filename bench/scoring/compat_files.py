@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.compat.readings import Chain, consensus, score_record, standardise
+from bench.compat.chain import Chain
+from bench.compat.readings import consensus, score_record, standardise
 from bench.matching import as_weights
 from bench.scoring.scores import Errors, Frames, Rows, label_of
 from bench.scoring.truth import Truth, blocks

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from statistics import NormalDist
 
@@ -91,11 +92,9 @@ def draw(path: Path, seed: int = 0) -> None:
     for ax in axes:
         ax.grid(alpha=0.3)
         ax.legend(fontsize=6.5)
-    temporary = path.with_name(path.name + ".tmp")
-    figure.savefig(temporary, format="png", dpi=100, metadata={"Software": None})
-    content = temporary.read_bytes()
-    temporary.unlink()
-    write_bytes(path, content)
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": None})
+    write_bytes(path, buffer.getvalue())
 
 
 def _draw_depths(ax: Axes, rng: np.random.Generator) -> None:

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.compat import readings as compat
+from bench import compat
 from bench.compat.chain import dir_to_dir_rotation, exp_so3
 from bench.compat.eap import eap_iou
+from bench.compat.readings import SYMMETRY
 from bench.matching import project_rotations
 from bench.metrics import sample_errors
 from tests.helpers import made
@@ -72,7 +73,7 @@ def test_components_by_the_public_metrics(cases):
             camera_T_part_pred=pose,
             pivot_pred=given["pred_pivot"],
             axis_pred=given["pred_dir"],
-            symmetry=matrix(compat.SYMMETRY.get(given["shape_type"])),
+            symmetry=matrix(SYMMETRY.get(given["shape_type"])),
         )
         unit = given["expand"][:, None] if given["use_expand"] else 1
         named = {
