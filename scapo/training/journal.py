@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar, cast, final
 
 import torch
@@ -85,13 +84,8 @@ class StoredJournal(Journal):
     def __enter__(self) -> StoredJournal:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.pool.__exit__(kind, error, trace)
+    def __exit__(self, *exc: object) -> None:
+        self.pool.__exit__(*exc)
 
     def ahead(self, jobs: Sequence[Callable[[], T]]) -> Sequence[Callable[[], T]]:
         """In the worker processes, where there are several of both."""

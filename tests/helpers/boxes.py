@@ -40,3 +40,11 @@ def laptop(
         upper=np.array([np.radians(130)]),
         origin=origin(name),
     )
+
+
+def above(distance: float) -> np.ndarray:
+    """camera_T_object above the origin: x to the object's -y, y to -x, z down."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
+    pose[2, 3] = distance
+    return pose

@@ -15,17 +15,10 @@ from sim_assets.rendering.backends import resolve_backend
 from sim_assets.rendering.base import BACKGROUND, RenderError, pixel_rays
 from sim_assets.rendering.embree import RaycastRenderer
 from sim_assets.sampling.viewpoints import Outline, draw_views, generator
-from tests.helpers.boxes import box, laptop
+from tests.helpers.boxes import above, box, laptop
 
 CAMERA = Intrinsics.from_fov(np.radians(60), 128, 128)
 OPEN = np.array([np.radians(90)])
-
-
-def above(distance: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-    pose[2, 3] = distance
-    return pose
 
 
 @pytest.fixture

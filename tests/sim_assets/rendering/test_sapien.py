@@ -19,7 +19,7 @@ from sim_assets.procedural import RECIPES, generate
 from sim_assets.rendering.backends import make_renderer, resolve_backend
 from sim_assets.rendering.base import BACKGROUND, AbstractRenderer, Frame, RenderError
 from sim_assets.sampling.viewpoints import Outline, View, draw_views, generator
-from tests.helpers.boxes import laptop
+from tests.helpers.boxes import above, laptop
 
 pytestmark = pytest.mark.render
 
@@ -106,17 +106,9 @@ def test_sapien_agrees_with_ray_casting_on_real_models(folder, shared_dir, sapie
     )
 
 
-def straight_down(distance: float) -> Float[np.ndarray, "4 4"]:
-    """Camera above the origin: x to the object's -y, y to -x, z down."""
-    pose = np.eye(4)
-    pose[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-    pose[2, 3] = distance
-    return pose
-
-
 def test_depth_and_part_of_a_box_from_above(sapien_renderer):
     sapien_renderer.open(laptop(thickness=0.02))
-    frame = sapien_renderer.render(np.array([0.0]), straight_down(0.5), CAMERA)
+    frame = sapien_renderer.render(np.array([0.0]), above(0.5), CAMERA)
     assert frame.part[128, 128] == 1
     np.testing.assert_allclose(frame.depth[frame.part == 1], 0.48, atol=2e-6)
     assert frame.depth[0, 0] == 0
@@ -127,7 +119,7 @@ def test_depth_and_part_of_a_box_from_above(sapien_renderer):
 
 def test_a_part_alone_and_all_again(sapien_renderer):
     sapien_renderer.open(laptop())
-    pose, state = straight_down(0.5), np.array([0.0])
+    pose, state = above(0.5), np.array([0.0])
     whole = sapien_renderer.render(state, pose, CAMERA)
     base = sapien_renderer.render(state, pose, CAMERA, 0)
     assert set(np.unique(base.part)) == {0, BACKGROUND}
@@ -226,7 +218,7 @@ def through_the_loader(
 def test_rendering_nothing_is_refused():
     renderer = make_renderer("sapien")
     with pytest.raises(RenderError, match="expected an open object"):
-        renderer.render(np.array([0.0]), straight_down(1.0), CAMERA)
+        renderer.render(np.array([0.0]), above(1.0), CAMERA)
 
 
 def test_every_category_is_either_procedural_or_real_here():

@@ -24,16 +24,9 @@ from sim_assets.sampling.cloud import (
     visible_pixels,
 )
 from sim_assets.sampling.viewpoints import Outline, draw_views, generator
-from tests.helpers.boxes import box, laptop
+from tests.helpers.boxes import above, box, laptop
 
 CAMERA = Intrinsics.from_fov(np.radians(60), 256, 256)
-
-
-def above(distance: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = [[0, -1, 0], [-1, 0, 0], [0, 0, -1]]
-    pose[2, 3] = distance
-    return pose
 
 
 def picture(thing, state: float, pose: np.ndarray) -> Frame:
