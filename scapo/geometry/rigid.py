@@ -141,12 +141,8 @@ def project_rotation(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]
     return special_procrustes(matrix)
 
 
-def mean_rotation(
-    rotations: Float[Tensor, "*B K 3 3"], weight: Float[Tensor, "*B K"] | None = None
-) -> Float[Tensor, "*B 3 3"]:
-    """Chordal mean: the projection of the (weighted) sum over K."""
-    if weight is not None:
-        rotations = rotations * weight[..., None, None]
+def mean_rotation(rotations: Float[Tensor, "*B K 3 3"]) -> Float[Tensor, "*B 3 3"]:
+    """Chordal mean: the projection of the sum over K."""
     return project_rotation(rotations.sum(-3))
 
 
