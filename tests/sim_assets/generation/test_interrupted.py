@@ -28,8 +28,8 @@ from scapo.training.optimiser import Descent, NotFiniteError, make_optimiser
 from scapo.training.precision import Arithmetic, scaler
 from scapo.training.run_folder import kept
 from scapo.types import Labels, Observation
-from tests.bench.runs.test_train import SMALL
 from tests.helpers import made
+from tests.helpers.small import FLAGS
 from tests.helpers.tiny import tiny, tiny_data
 from tests.helpers.two_ranks import Line
 from tests.scapo.training.test_fit import CONFIG
@@ -122,7 +122,7 @@ def test_ctrl_c_is_one_line_and_the_run_goes_on(tmp_path: Path) -> None:
     made.make_data(tmp_path / "data", train=16)
     run = tmp_path / "run"
     command = [sys.executable, "-m", "bench", "train", "scapo", "--category", "laptop"]
-    command += ["--data", str(tmp_path / "data"), "--out", str(run), "--device", "cpu", *SMALL]
+    command += ["--data", str(tmp_path / "data"), "--out", str(run), "--device", "cpu", *FLAGS["scapo"]]
     command += ["--no-pictures", "--checkpoint-every", "0"]
     command[command.index("--epochs") + 1] = "2000"
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
