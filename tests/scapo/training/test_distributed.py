@@ -146,7 +146,8 @@ def test_the_second_process_of_a_command_trains_and_says_and_writes_nothing(
     monkeypatch.setattr(Ranks, "share", lambda _, index: index)
     monkeypatch.setattr(training, "joined", lambda device: nullcontext(second))
     made.make_data(tmp_path / "data", train=16)
-    words = ["train", "scapo", "--category", "laptop", "--device", "cpu", *FLAGS["scapo"]]
+    words = ["train", "scapo", "--category", "laptop", "--device", "cpu"]
+    words += FLAGS["scapo"]
     main([*words, "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")])
     assert capsys.readouterr() == ("", "")
     assert moved == [True]
@@ -157,7 +158,8 @@ def test_the_second_process_of_a_command_trains_and_says_and_writes_nothing(
 def test_the_command_as_torchrun_starts_it(tmp_path: Path) -> None:
     """One run, one report, one set of lines, whatever the number of processes."""
     made.make_data(tmp_path / "data", train=16)
-    words = ["-m", "bench", "train", "scapo", "--category", "laptop", "--device", "cpu", *FLAGS["scapo"]]
+    words = ["-m", "bench", "train", "scapo", "--category", "laptop", "--device", "cpu"]
+    words += FLAGS["scapo"]
     words += ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
     done = torchrun(*words)
     assert done.returncode == 0, done.stderr[-3000:]

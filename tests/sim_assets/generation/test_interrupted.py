@@ -122,8 +122,8 @@ def test_ctrl_c_is_one_line_and_the_run_goes_on(tmp_path: Path) -> None:
     made.make_data(tmp_path / "data", train=16)
     run = tmp_path / "run"
     command = [sys.executable, "-m", "bench", "train", "scapo", "--category", "laptop"]
-    command += ["--data", str(tmp_path / "data"), "--out", str(run), "--device", "cpu", *FLAGS["scapo"]]
-    command += ["--no-pictures", "--checkpoint-every", "0"]
+    command += ["--data", str(tmp_path / "data"), "--out", str(run), "--device", "cpu"]
+    command += [*FLAGS["scapo"], "--no-pictures", "--checkpoint-every", "0"]
     command[command.index("--epochs") + 1] = "2000"
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
