@@ -29,6 +29,8 @@ from scapo.store.provenance import PACKAGE, commit
 FORMAT = "scapo-plan/1"
 PLAN = "plan.json"
 SIZES = {"train": 5000, "val": 1000, "test": 1000, "test-ood": 800}
+SCORABLE = ("val", "test", "test-ood")
+"""Predictions on `train` are for frames, not for scores."""
 """Samples of the benchmark's splits, for estimates before they are there."""
 SCORING = 25.0
 """Seconds that `evaluate` takes, with the readings beside it, for a thousand samples."""
@@ -142,7 +144,11 @@ def make_plan(
 
     Raises:
         StoreError: Damaged data.
+        ValueError: A split that is none, or that of the training.
     """
+    for split in splits:
+        if split not in SCORABLE:
+            raise ValueError(f"--splits: expected some of {', '.join(SCORABLE)}, found {split!r}")
     preset = presets[name]
     preset = replace(preset, splits=tuple(splits) or preset.splits,
                      budget=preset.budget if minutes is None else minutes)  # fmt: skip

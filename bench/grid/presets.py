@@ -162,7 +162,7 @@ PRESETS: Mapping[PresetName, Preset] = {
         splits=("test",),
         budget=0.1,
         calibration=16,
-        sizes={"train": (96, 6), "test": (16, 4)},
+        sizes={"train": (96, 6), "val": (16, 4), "test": (16, 4), "test-ood": (16, 4)},
     ),
     "cpu": Preset(entries=GRID, budget=20.0),
     "paper": Preset(entries=GRID),

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -82,7 +83,7 @@ class Grid:
         if request.gpus < 0 or (request.gpus > 1 and request.gpus != int(request.gpus)):
             raise ValueError(f"--gpus: expected a share of one or a whole number, found "
                              f"{request.gpus}")  # fmt: skip
-        if request.budget_minutes is not None and request.budget_minutes <= 0:
+        if request.budget_minutes is not None and not 0 < request.budget_minutes < math.inf:
             raise ValueError(f"--budget-minutes: expected more than 0, found "
                              f"{request.budget_minutes}")  # fmt: skip
         self.request, self.presets = request, presets

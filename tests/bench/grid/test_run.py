@@ -132,6 +132,9 @@ def test_the_table_of_what_goes_on(folder: Path):
     [
         (["--gpus", "1.5"], "--gpus: expected a share of one or a whole number, found 1.5"),
         (["--budget-minutes", "0"], "--budget-minutes: expected more than 0, found 0.0"),
+        (["--budget-minutes", "nan"], "--budget-minutes: expected more than 0, found nan"),
+        (["--splits", "vall", "--plan-only"], "--splits: expected some of val, test, test-ood"),
+        (["--splits", "train", "--plan-only"], "--splits: expected some of val, test, test-ood"),
         (["--only", "nothing", "--plan-only"], "only: expected parts (clean)"),
     ],
 )
@@ -140,6 +143,13 @@ def test_what_cannot_be_asked(flag: list[str], message: str, tmp_path: Path, cap
         program.main(["run", "smoke", "--out", str(tmp_path / "out"), *flag])
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("split", ["val", "test-ood"])
+def test_smoke_can_be_scored_on_another_split(split: str, tmp_path: Path):
+    """Its sizes are its own: one for each split that may be asked for."""
+    program.main(["run", "smoke", "--out", str(tmp_path), "--splits", split, "--plan-only"])
+    assert f"clean/oven/{split}" in (tmp_path / "plan.json").read_text()
 
 
 def here(name: str, words: Sequence[str], log: Path, **options: object) -> float:
