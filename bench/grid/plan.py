@@ -29,9 +29,9 @@ from scapo.store.provenance import PACKAGE, commit
 FORMAT = "scapo-plan/1"
 PLAN = "plan.json"
 SIZES = {"train": 5000, "val": 1000, "test": 1000, "test-ood": 800}
+"""Samples of the benchmark's splits, for estimates before they are there."""
 SCORABLE = ("val", "test", "test-ood")
 """Predictions on `train` are for frames, not for scores."""
-"""Samples of the benchmark's splits, for estimates before they are there."""
 SCORING = 25.0
 """Seconds that `evaluate` takes, with the readings beside it, for a thousand samples."""
 START = 4.0
