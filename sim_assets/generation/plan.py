@@ -16,7 +16,7 @@ from typing import Any
 from scapo.categories import Category
 from scapo.store import canonical_json
 from scapo.store.definitions import definition
-from scapo.store.manifest import Instance
+from scapo.store.manifest import MAX_POINTS, Instance
 from sim_assets.generation.assets import Asset
 from sim_assets.models.account import sentences
 from sim_assets.objects import ArticulatedObject
@@ -136,6 +136,9 @@ def plan_shards(request: Request, entries: Sequence[Entry], instances: int) -> l
     size = max(1, round(SHARD_SAMPLES / each)) * each
     if each > 2 * SHARD_SAMPLES:
         size = math.ceil(SHARD_SAMPLES / states) * states
+    most = MAX_POINTS // (request.settings.points * states) * states  # that a reader takes
+    if size > most:
+        size = most // each * each or most
     shards = []
     for number, first in enumerate(range(0, request.count, size)):
         last = min(first + size, request.count)

@@ -9,6 +9,7 @@ from math import ceil
 
 from scapo.categories import Category
 from scapo.categories import category as find_category
+from scapo.store.manifest import MAX_POINTS
 from sim_assets.generation.assets import Asset, folder_assets, procedural_assets
 from sim_assets.generation.plan import Request
 from sim_assets.models.frames import check_wanted
@@ -148,6 +149,9 @@ def _check(options: DataOptions) -> None:
     for name, value, minimum in least:
         if value is not None and value < minimum:
             raise ValueError(f"{name}: expected {minimum} or more, found {value}")
+    most = MAX_POINTS // options.states_per_view  # a shard holds whole views
+    if options.points > most:
+        raise ValueError(f"points: expected {most} or less, found {options.points}")
     if options.image_size is not None and options.image_size > MAX_IMAGE:
         raise ValueError(f"image_size: expected {MAX_IMAGE} or less, found {options.image_size}")
     if options.instances is not None and options.instances > options.count:

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from scapo.categories import CATEGORIES
 from scapo.geometry.camera import Intrinsics
+from scapo.store.manifest import MAX_POINTS
 from sim_assets.generation.assets import ProceduralAsset
 from sim_assets.generation.plan import (
     SHARD_SAMPLES,
@@ -89,6 +92,16 @@ def test_whole_instances_share_a_shard_where_they_fit():
     assert [len(shard.pieces) for shard in shards] == [6, 4]
     assert [shard.count for shard in plan_shards(request(100), entries(2), 2)] == [50, 50]
     assert [shard.count for shard in plan_shards(request(300), entries(1), 1)] == [64] * 4 + [44]
+
+
+@pytest.mark.parametrize(("points", "states"), [(300_000, 1), (300_000, 5), (2**24, 1)])
+def test_shards_of_many_points_are_no_larger_than_a_reader_takes(points, states):
+    wanted = request(60, states)
+    wanted = replace(wanted, settings=replace(wanted.settings, points=points))
+    shards = plan_shards(wanted, entries(2), 2)
+    assert sum(shard.count for shard in shards) == 60
+    assert all(shard.count * points <= MAX_POINTS for shard in shards)
+    assert all(shard.count % states == 0 for shard in shards)
 
 
 def test_options_hold_all_that_changes_pixels():

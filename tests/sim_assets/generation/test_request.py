@@ -30,6 +30,11 @@ def test_options_out_of_range_are_refused():
     for change, message in (
         ({"count": 0}, "count: expected 1 or more, found 0"),
         ({"points": 7}, "points: expected 8 or more, found 7"),
+        ({"points": 2**24 + 1}, "points: expected 16777216 or less, found 16777217"),
+        (
+            {"points": 2**23 + 1, "states_per_view": 2},
+            "points: expected 8388608 or less, found 8388609",
+        ),
         ({"instances": 31}, "instances: expected at most count, 30, found 31"),
         ({"states_per_view": 4}, "count: expected a multiple of states_per_view, 4, found 30"),
         ({"image_size": 5000}, "image_size: expected 4096 or less, found 5000"),
