@@ -41,6 +41,24 @@ def _shortened(text: str, longest: int) -> str:
     return f"{text[: longest - tail - 3]} … {text[len(text) - tail :]}"
 
 
+def in_words(error: Exception) -> str:
+    """What an error says; of a file that the system refused: where, what was expected, what came.
+
+    >>> in_words(PermissionError(13, "Permission denied", "out"))
+    'out: expected a place that can be read or written, found: Permission denied'
+    >>> in_words(ValueError("points: expected 3, found 2"))
+    'points: expected 3, found 2'
+    >>> in_words(FileExistsError(17, "File exists", "out"))
+    'out: expected a folder, found a file'
+    """
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        if isinstance(error, FileExistsError):  # what `mkdir` says where the folder is a file
+            return f"{error.filename}: expected a folder, found a file"
+        reason = error.strerror
+        return f"{error.filename}: expected a place that can be read or written, found: {reason}"
+    return str(error)
+
+
 def is_word(text: str) -> bool:
     r"""Whether a name from outside can be that of a folder, and nothing but that.
 

@@ -34,7 +34,10 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     """
     refuse_foreign(folder, made_here)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:  # it names a folder that nobody asked for
+        raise OSError(error.errno, error.strerror, str(folder)) from error
     try:
         temporary.chmod(0o755)
         yield temporary

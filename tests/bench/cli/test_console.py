@@ -71,6 +71,16 @@ def test_a_refusal_is_one_line_that_obeys_nothing(name, tmp_path, capsys):
         assert f"scapo-bench: {tmp_path / name}: expected a folder of scores" in said.err
 
 
+def test_a_place_that_is_a_file_is_told_with_what_was_expected(folder, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as ended:
+        program.main(["evaluate", "--predictions", str(folder / "p.safetensors"), "--data",
+                      str(folder / "data"), "--out", str(tmp_path / "file/s.csv.gz")])  # fmt: skip
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert said == f"scapo-bench: {tmp_path / 'file'}: expected a folder, found a file\n"
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [(field, "x" * 10**6) for field in ("method", "variant", "seed", "budget", "supervision")],

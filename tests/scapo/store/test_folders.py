@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from scapo.store import folders
 from scapo.store.folders import digests, made_here, whole_folder
 
 
@@ -146,3 +147,15 @@ def test_digests_tell_kinds_apart(tmp_path: Path):
         "file": True,
         "link": False,
     }
+
+
+def test_a_place_that_cannot_be_made_is_told_by_the_name_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(prefix: str, dir: Path) -> str:  # noqa: A002 - as `mkdtemp` names it
+        raise PermissionError(13, "Permission denied", f"{dir}/{prefix}xyz")
+
+    monkeypatch.setattr(folders.tempfile, "mkdtemp", refuse)
+    with pytest.raises(OSError, match="Permission denied") as refused:
+        write(tmp_path / "out", "one")
+    assert refused.value.filename == str(tmp_path / "out")

@@ -16,6 +16,18 @@ def test_an_interrupt_in_an_import(repository: Path, struck: str) -> None:
     check_struck("sim_assets", struck, repository)
 
 
+def test_a_place_that_is_a_file_is_told_with_what_was_expected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as ended:
+        run(["build", "oven", "--count", "1", "--out", str(tmp_path / "file")])
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    where, expected = tmp_path / "file/oven", "a place that can be read or written"
+    assert said == f"scapo-data: {where}: expected {expected}, found: Not a directory\n"
+
+
 def test_a_verb_that_is_none_is_told_the_one_that_looks_like_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
