@@ -41,14 +41,14 @@ def _shortened(text: str, longest: int) -> str:
     return f"{text[: longest - tail - 3]} … {text[len(text) - tail :]}"
 
 
-def in_words(error: Exception) -> str:
+def words_of(error: Exception) -> str:
     """What an error says; of a file that the system refused: where, what was expected, what came.
 
-    >>> in_words(PermissionError(13, "Permission denied", "out"))
+    >>> words_of(PermissionError(13, "Permission denied", "out"))
     'out: expected a place that can be read or written, found: Permission denied'
-    >>> in_words(ValueError("points: expected 3, found 2"))
+    >>> words_of(ValueError("points: expected 3, found 2"))
     'points: expected 3, found 2'
-    >>> in_words(FileExistsError(17, "File exists", "out"))
+    >>> words_of(FileExistsError(17, "File exists", "out"))
     'out: expected a folder, found a file'
     """
     if isinstance(error, OSError) and error.strerror and error.filename:

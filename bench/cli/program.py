@@ -17,7 +17,7 @@ from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
 from bench.requests import UsageError
 from scapo.interrupt import exit_if_unheard, exit_interrupted
-from scapo.text import in_words, unknown_word
+from scapo.text import unknown_word, words_of
 
 DESCRIPTION = (
     "Train, predict, score and tabulate methods of articulated pose estimation "
@@ -78,7 +78,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, OSError, ArithmeticError, RuntimeError) as error:
         if isinstance(error, BrokenPipeError):
             exit_if_unheard()
-        say(errors, f"scapo-bench: {in_words(error)}")
+        say(errors, f"scapo-bench: {words_of(error)}")
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt as stop:
         say(errors, f"scapo-bench: {str(stop) or 'interrupted'}")

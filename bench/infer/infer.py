@@ -16,7 +16,7 @@ from bench.infer.model import Model, load_models
 from bench.infer.readers import ReadOptions, find_inputs, read_input
 from bench.requests import InferRequest, Mode, UsageError, require_some
 from bench.runs.train import pick_device
-from scapo.text import in_words, is_word, one_line
+from scapo.text import is_word, one_line, words_of
 
 CLOSE = 0.05
 """Difference of residuals from which on one category explains a view clearly better."""
@@ -95,7 +95,7 @@ def _one(
         result = answer(path.stem, cloud, models, request.mode, given)
         write_result(result, folder)
     except (ValueError, OSError, ArithmeticError, RuntimeError, MemoryError) as error:
-        words = one_line(in_words(error)) or type(error).__name__
+        words = one_line(words_of(error)) or type(error).__name__
         return Done(source=path, error=words if str(path) in words else f"{path}: {words}")
     return Done(source=path, folder=folder, result=result)
 

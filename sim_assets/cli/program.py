@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from scapo.interrupt import exit_if_unheard, exit_interrupted
-from scapo.text import in_words, unknown_word
+from scapo.text import unknown_word, words_of
 from sim_assets.cli.console import say
 from sim_assets.cli.verbs import VERBS, UsageError
 
@@ -50,7 +50,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
     except (ValueError, OSError, RuntimeError) as error:
         if isinstance(error, BrokenPipeError):
             exit_if_unheard()
-        say(errors, f"scapo-data: {in_words(error)}")
+        say(errors, f"scapo-data: {words_of(error)}")
         sys.exit(2 if isinstance(error, UsageError) else 1)
     except KeyboardInterrupt:
         say(errors, "scapo-data: stopped; the same command takes it up where it was")
