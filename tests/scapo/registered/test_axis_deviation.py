@@ -146,7 +146,7 @@ def test_the_first_span_that_explains_enough_is_taken(
     monkeypatch.setattr(axis_deviation, "deviating_templates", tried)
     monkeypatch.setattr(axis_deviation, "refine_deviations", judged)
     taken = with_axis_deviation(start, views, DiscoveryConfig(), generator(0))
-    enough = 1 - (LEAST_GAIN if len(gains) > 1 else LEAST_GAIN_PARALLEL)
+    enough = 1 - {1: LEAST_GAIN_PARALLEL, 2: LEAST_GAIN}[len(gains)]
     assert taken is (made[-1] if gains[-1] < enough else start)
     assert [one is None for one in asked] == [False, True][: len(gains)]
 
