@@ -3,13 +3,13 @@
 """Do exported twins load, and do their joints move them as the true objects move?
 
     python scripts/experiments/twins.py DATA CATEGORY [CATEGORY ...] [--split val] [--count 20]
-        [--predictions FILE] [--source MODELS] [--bare]
+        [--model released|MODEL] [--source MODELS] [--bare]
 
-DATA is a folder of procedural objects (`sim-art-2/clean`), or of the models in MODELS. Without
-`--predictions` the true parts, poses and joints stand for the prediction and the model's shape is
+DATA is a folder of procedural objects (`sim-art-2/clean`) with images, or of the models in MODELS.
+Without `--model` the true parts, poses and joints stand for the prediction and the model's shape is
 1,600 points of the true surface (`--bare`: none, the observed points alone), so that what is left
-is the export's own error. With it, of one category, joints and parts are the file's, of the views
-that it answers, and so is the shape where it has `canonical_points`.
+is the export's own error. With it all is what `scapo-bench infer` would say of each view's image:
+by a run, a checkpoint or a released model, `released` for that of each category's own name.
 
 Prints a row for each category: objects, hinge directions within 5 degrees, pivots within 5 % of
 the object's diagonal, URDFs that SAPIEN loads and drives through their range, URDFs that yourdfpy
