@@ -17,6 +17,7 @@ import tyro
 
 from bench.matching import LabelOrder
 from bench.metrics import ApRule, IouKind, PivotKind, RotationKind
+from scapo.ranges import ANY, CountOrNone, Port, Positive, Seed
 
 Mode = Literal["fast", "quick", "refine", "whole"]
 """`scapo.method.Mode`, written out: that module loads torch."""
@@ -185,12 +186,12 @@ class StabilityRequest(RunRequest):
     """Clouds, evenly spread over the split."""
     motions: int = 2
     """Random motions of each kind for each cloud."""
-    resamplings: int = 20
+    resamplings: CountOrNone = 20
     """Random subsets of each cloud; 0 for none."""
     points: int | None = None
     """Points of a subset; by default half of the clouds' own, at most 1,024. Data generated with
     --points 4096 have new points to draw, where halves of 1,024 share theirs."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the motions and subsets."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
@@ -231,7 +232,7 @@ class StudyRequest:
     """Inference modes to study; both: fast and refine."""
     calibration: int = 500
     """Training clouds that fix the frames of a method that saw no poses."""
-    samples: int = 20
+    samples: CountOrNone = 20
     """Clouds for stability; 0 leaves it out."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, ..."""
@@ -254,9 +255,9 @@ class TrainRequest(Generic[M]):
     """Split for methods with a validation pass; without it, every tenth object of --split."""
     device: str = "auto"
     """Where the networks run: auto (CUDA where there is a GPU), cpu, cuda, cuda:1, ..."""
-    seed: int = 1
+    seed: Seed = 1
     """Seed of the first weights, the order of the data and the augmentation."""
-    workers: int | None = None
+    workers: CountOrNone | None = None
     """Processes for what the start of a stage can do side by side, beside this one, which waits;
     by default as many as torch has threads (OMP_NUM_THREADS)."""
     resume: bool = False
@@ -308,7 +309,7 @@ class GridRequest:
     seed1), or several joined by /, such as clean/registered."""
     splits: tuple[str, ...] = ()
     """Splits to score, such as val while a method is being made; by default test and test-ood."""
-    budget_minutes: float | None = None
+    budget_minutes: Positive | None = None
     """Time of each training on one core, which bounds its epochs; by default the preset's."""
     real: Path | None = None
     """Real models of yours, PATH/CATEGORY/ID/*.urdf, to be scored too."""
@@ -357,11 +358,11 @@ class InferRequest(ModelRequest):
     intrinsics: str | None = None
     """Camera of a depth image: fx,fy,cx,cy in pixels, or a JSON or YAML file; else NAME.json,
     NAME.yaml, intrinsics.json or intrinsics.yaml beside it."""
-    scale: float | None = None
+    scale: Positive | None = None
     """Metres in one unit of the input; by default 0.001 for images of whole numbers, else 1."""
-    sensor: tuple[float, float, float] | None = None
+    sensor: Annotated[tuple[float, float, float] | None, ANY] = None
     """Centre of the camera in metres, for clouds in another frame than the camera's."""
-    up: tuple[float, float, float] | None = None
+    up: Annotated[tuple[float, float, float] | None, ANY] = None
     """Against gravity in the frame of the input (of a level camera 0 -1 0), where that is known and
     objects stand upright: models of template registration then turn none over."""
 
@@ -390,7 +391,7 @@ class CalibrateRequest:
 class DemoRequest(ModelRequest):
     """Where the page is served, and what it takes."""
 
-    port: int = 8000
+    port: Port = 8000
     """Port of the page."""
     host: str = "127.0.0.1"
     """Address that is listened at; 0.0.0.0 lets other machines in."""

@@ -27,6 +27,7 @@ from scapo.first_weights import uniform
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import gather, k_nearest, nearest
 from scapo.method import evenly
+from scapo.ranges import Neighbours
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,11 +38,11 @@ class Gcn3dConfig:
     """Where the other defaults come from."""
     support: int = 7
     """Directions of a kernel."""
-    neighbours: int = 10
+    neighbours: Neighbours = 10
     """Points that a point is convolved with."""
     widths: tuple[int, int, int, int, int] = (128, 128, 256, 256, 512)
     """Channels of the five convolutions; a pool follows the second and the fourth."""
-    pool_neighbours: int = 4
+    pool_neighbours: Neighbours = 4
     """Points of which a pool takes the greatest feature."""
     fuse: tuple[int, int] = (512, 512)
     """Channels of the layers on all features of a point together."""

@@ -29,6 +29,7 @@ from bench.baselines.registration import (
 )
 from scapo.categories import Category
 from scapo.geometry.points import MEAN_RADIUS
+from scapo.ranges import Positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +41,7 @@ class IcpConfig(RegistrationConfig):
     the least residual go on, so many in all."""
     first_iterations: int = 10
     """Those first steps, at most."""
-    first_reach: float = 0.8
+    first_reach: Positive = 0.8
     """The reach of the first steps: the centroid of a partial view is off the template's."""
 
 

@@ -29,6 +29,7 @@ from bench.baselines.registration import (
     Target,
 )
 from scapo.categories import Category
+from scapo.ranges import Positive
 
 MISSING = "kiss-matcher: expected the package kiss_matcher (pip install kiss-matcher), found none"
 NORMAL_RADIUS, FEATURE_RADIUS = 3.0, 5.0
@@ -42,7 +43,7 @@ LEAST_KEYPOINTS = 10
 class KissMatcherConfig(RegistrationConfig):
     """KISS-Matcher to ICP's templates; all of its radii and bounds follow from the voxel."""
 
-    voxel: float = 0.03
+    voxel: Positive = 0.03
     """Normalised length (the mean radius is 0.25) that points are thinned to."""
 
 

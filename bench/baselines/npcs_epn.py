@@ -38,6 +38,7 @@ from scapo.method import (
     StepDecay,
     changes,
 )
+from scapo.ranges import Positive, Share
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 FEWEST = 8
@@ -61,7 +62,7 @@ class NpcsEpnConfig:
     such clouds, asks up to four about all points by interpolation, and takes the mean."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Sizes of the network."""
-    reach: float = 0.2
+    reach: Positive = 0.2
     """Distance from an axis within which points vote for it."""
     coordinate_weight: float = 10.0
     """Weight of the distance of the part coordinates."""
@@ -74,11 +75,11 @@ class NpcsEpnConfig:
     either_order: bool = True
     """Take the labels or, where parts of the category are exchanged by a symmetry, the exchanged
     ones, whichever costs a cloud less: what the evaluation accepts."""
-    rotated: float = 0.5
+    rotated: Share = 0.5
     """Share of the clouds that are turned by a random rotation in a training step."""
     draws: int = 100
     """Samples of three points of RANSAC."""
-    threshold: float = 0.1
+    threshold: Positive = 0.1
     """Distance within which a point agrees with a pose, in diagonals of the part's box."""
     epochs: int = 200
     """Epochs of the one stage."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -17,19 +18,22 @@ from scapo.equivariant.epn import SeparableBlock
 from scapo.equivariant.layers import PointPool
 from scapo.equivariant.levels import LevelConfig, levels
 from scapo.geometry.numerics import at_least_float32
+from scapo.ranges import Neighbours, Positive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkConfig:
     """Sizes; lengths in units of four times the mean radius."""
 
+    LIKE: ClassVar[tuple[tuple[str, ...], ...]] = (("widths", "strides", "radii", "neighbours"),)
+
     widths: tuple[int, ...] = (64, 64, 128, 128, 256)
     """Channels of each block, of each of the 60 anchors."""
     strides: tuple[int, ...] = (2, 1, 2, 1, 2)
     """Each block keeps one point of so many."""
-    radii: tuple[float, ...] = (0.12, 0.12, 0.24, 0.24, 0.48)
+    radii: tuple[Positive, ...] = (0.12, 0.12, 0.24, 0.24, 0.48)
     """Radii of the groups of each block."""
-    neighbours: tuple[int, ...] = (32, 16, 32, 16, 32)
+    neighbours: tuple[Neighbours, ...] = (32, 16, 32, 16, 32)
     """Most points of a group of each block."""
     frames: int = 8
     """Soft frames that anchors are attended to in; a divisor of all widths and of the code."""

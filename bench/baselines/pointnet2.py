@@ -24,6 +24,7 @@ from bench.baselines.body import Block, Body, Features
 from bench.baselines.supervised import LEAN, LearningConfig, SupervisedMethod
 from scapo.categories import Category
 from scapo.geometry.points import farthest_points, gather, k_nearest
+from scapo.ranges import Neighbours, Positive
 
 Widths = tuple[int, ...]
 
@@ -37,19 +38,23 @@ ZERO = 1e-9
 class PointNet2Config:
     """PointNet++, supervised; as published for part segmentation."""
 
+    LIKE: ClassVar[tuple[tuple[str, ...], ...]] = (
+        ("near_radii", "near_samples", "near_widths"),
+        ("far_radii", "far_samples", "far_widths"),
+    )
     preset: Literal["paper", "cpu"] = "paper"
     """Where the other defaults come from."""
     centres: tuple[int, int] = (512, 128)
     """Groups of the two levels."""
-    near_radii: tuple[float, ...] = (0.1, 0.2, 0.4)
+    near_radii: tuple[Positive, ...] = (0.1, 0.2, 0.4)
     """Radii of the groups of points, in units of twice the mean radius."""
-    near_samples: tuple[int, ...] = (32, 64, 128)
+    near_samples: tuple[Neighbours, ...] = (32, 64, 128)
     """Points of a group of each radius."""
     near_widths: tuple[Widths, ...] = ((32, 32, 64), (64, 64, 128), (64, 96, 128))
     """Channels of the layers of each radius."""
-    far_radii: tuple[float, ...] = (0.4, 0.8)
+    far_radii: tuple[Positive, ...] = (0.4, 0.8)
     """Radii of the groups of groups, in the same unit."""
-    far_samples: tuple[int, ...] = (64, 128)
+    far_samples: tuple[Neighbours, ...] = (64, 128)
     """Groups of a group of each radius."""
     far_widths: tuple[Widths, ...] = ((128, 128, 256), (128, 196, 256))
     """Channels of the layers of each radius."""

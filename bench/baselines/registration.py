@@ -33,6 +33,7 @@ from scapo.geometry.points import MEAN_RADIUS, Similarity, normalise
 from scapo.geometry.rigid import invert
 from scapo.geometry.rotations import rotmat_to_rotvec
 from scapo.method import Mode, OracleMethod, Stage, Step, changes
+from scapo.ranges import Positive
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 Points = Float[np.ndarray, "N 3"]
@@ -45,7 +46,7 @@ class RegistrationConfig(FusionConfig):
 
     points: int = 128
     """Points of the cloud or part that are registered."""
-    reach: float = 0.4
+    reach: Positive = 0.4
     """Correspondences farther apart than this times the mean radius do not count."""
     iterations: int = 30
     """Steps of ICP from each first pose, at most."""

@@ -40,6 +40,7 @@ from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import MEAN_RADIUS, gather, normalise
 from scapo.geometry.rigid import apply, invert, random_rotations, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, changes
+from scapo.ranges import Share
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 RADIUS = 0.5
@@ -60,14 +61,14 @@ class LearningConfig:
     """How part poses are found: by votes of all points, or regressed from pooled features."""
     width: int = 128
     """Channels of the hidden layer of each head."""
-    dropout: float = 0.5
+    dropout: Share = 0.5
     """Share of the features that the segmentation does not see in a training step."""
     either_order: bool = True
     """Take the labels or, where parts of the category are exchanged by a symmetry, the exchanged
     ones, whichever costs a cloud less: what the evaluation accepts."""
-    rotated: float = 0.5
+    rotated: Share = 0.5
     """Share of the clouds that are turned by a random rotation in a training step."""
-    noisy: float = 0.5
+    noisy: Share = 0.5
     """Share of the clouds that get noise in a training step."""
     noise: float = 1e-3
     """Standard deviation of the noise, in units of twice the mean radius."""

@@ -17,6 +17,7 @@ from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
 from bench.requests import UsageError
 from scapo.interrupt import exit_if_unheard, exit_interrupted
+from scapo.ranges import check_numbers
 from scapo.text import unknown_word, words_of
 
 DESCRIPTION = (
@@ -71,6 +72,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
                 tyro.conf.CascadeSubcommandArgs,
             ),
         )
+        check_numbers(command, "--")
         command.run(console)
     except MemoryError as error:
         say(errors, f"scapo-bench: expected enough memory, found: {error}")

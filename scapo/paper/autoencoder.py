@@ -30,6 +30,7 @@ from scapo.paper.vector_neurons import (
     spread_centres,
     uniform,
 )
+from scapo.ranges import Neighbours
 
 Projection = Literal["svd", "gram-schmidt"]
 PoseForm = Literal["pooled", "votes"]
@@ -39,7 +40,7 @@ PoseForm = Literal["pooled", "votes"]
 class EncoderConfig:
     """Sizes of Theta_E; defaults as VNT."""
 
-    neighbours: int = 40
+    neighbours: Neighbours = 40
     """Edges per point."""
     centres: int | None = None
     """Points that carry features; None = all of them."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from scapo.paper.autoencoder import DecoderConfig, EncoderConfig
 from scapo.paper.heads import HeadConfig, JointConfig
 from scapo.paper.objectives import LossConfig
 from scapo.paper.part_search import SearchConfig
+from scapo.ranges import MOST, Positive, Range
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +30,7 @@ class ScapoConfig:
     """Sizes of the keypoint and residual networks."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights and forms of the loss terms."""
-    gamma: float = 0.01
+    gamma: Positive = 0.01
     """Start of the skinning temperature, for a mean radius of 0.25."""
     template_start: Literal["medoid", "random"] = "medoid"
     """Y_base and K: the decoded medoid of the training codes, or random numbers."""
@@ -58,7 +59,7 @@ class ScapoConfig:
     supervision: tuple[Literal["segmentation", "joint", "instance"], ...] = ()
     """Labels that training may see: segmentation and joint in Table 2; instance where the run in
     `start` was told which clouds show the same object."""
-    epochs: tuple[int, ...] = (200, 200)
+    epochs: Annotated[tuple[int, ...], Range(1, MOST, many=(1, 2))] = (200, 200)
     """Epochs of each stage; one number for both."""
     lr: tuple[float, float] = (1e-3, 1e-4)
     """Learning rate at the start of each stage."""

@@ -26,6 +26,7 @@ from scapo.paper.skinning import (
     part_maps,
     to_canonical,
 )
+from scapo.ranges import Neighbours, Positive
 
 AblatedTerm = Literal["shape_var", "dir_align", "joint_prox", "joint_boundary"]
 
@@ -76,13 +77,13 @@ class LossConfig:
     variance_form: losses.VarianceForm = "per-point"
     variance_scale: float = 60.0
     proximity_scale: float = 30.0
-    proximity_neighbours: int = 1
+    proximity_neighbours: Neighbours = 1
     proximity_detach: bool = True
     """The points of L_joint-prox are constants."""
-    support: float = 20.0
+    support: Positive = 20.0
     """tau of L_kp-seg, in points."""
     support_mean: losses.KeypointMean = "parts"
-    boundary_temperature: float = 1.0
+    boundary_temperature: Positive = 1.0
     boundary_detach: bool = True
 
     def weight(self, term: str) -> float:

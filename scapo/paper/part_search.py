@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
-from typing import Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +36,7 @@ T = TypeVar("T", "Skeleton", "Placements")
 class SearchConfig:
     """How widely the start of stage 2 is looked for."""
 
+    LIKE: ClassVar[tuple[tuple[str, ...], ...]] = (("clouds", "steps"),)
     seeds: int = 10
     """Points of the template around which a part may be."""
     clouds: tuple[int, ...] = (16, 32, 64)

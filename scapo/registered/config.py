@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from scapo.categories import Category
+from scapo.ranges import CountOrNone, Range, Share
 from scapo.registered.joint_limits import RANGE_COST
 
 LEAST_ROTATIONS = 200
@@ -41,11 +42,11 @@ class DiscoveryConfig(TemplateConfig):
 
     seeds: int = 72
     """Views registered with one another in each draw, 10 ms a pair."""
-    agreeing: float = 0.4
+    agreeing: Share = 0.4
     """Share of the registered views, the most confident, that the first fit uses."""
     searched: int = 144
     """Views that the rounds of search and fit use, 0.2 s each and round."""
-    trusted: tuple[float, ...] = (0.55, 0.7, 0.85)
+    trusted: tuple[Share, ...] = (0.55, 0.7, 0.85)
     """Share of the searched views, the most confident, that each round keeps as inliers; the first
     round is on half of the views where mirror images are tried."""
     starts: int = 3
@@ -63,7 +64,7 @@ class DiscoveryConfig(TemplateConfig):
     """First templates that enter the rungs, those that explain the held-out views best."""
     dense_rounds: int = 4
     """Of building the dense template and fitting it, 5 s each: axes settle in them."""
-    heats: tuple[float, ...] = (0.4, 0.55)
+    heats: Annotated[tuple[float, ...], Range(0, 1, many=(0, 9))] = (0.4, 0.55)
     """Share of inliers in each rung of these, on half of the views; then the best goes on alone."""
     judged: int = 48
     """Views held out to judge templates, at most a quarter of all."""
@@ -107,7 +108,7 @@ class SearchConfig:
     """The template."""
     learned: int = 600
     """Training clouds in which the template is searched for thoroughly, 0.1 s each on one core."""
-    trusted: float = 0.85
+    trusted: Share = 0.85
     """Share of those clouds, the most confidently placed, that tell states, cameras and looks, and
     of the placed ones from which the network learns."""
     placed: int = 2000
@@ -132,7 +133,7 @@ class SearchConfig:
     """Of the layers of the network that is asked where nobody knows the camera."""
     points: int = 256
     """Points of each cloud that the network and the search see."""
-    grid_hypotheses: int = 16
+    grid_hypotheses: CountOrNone = 16
     """Placements of each cloud that `refine` begins with beside the network's: half of them as of
     clouds that look alike and were placed in training, half as of images of the template. 0: the
     network's alone."""

@@ -27,6 +27,7 @@ from scapo.categories import JointKind
 from scapo.geometry.points import Similarity, ends, nearest
 from scapo.geometry.rigid import apply, invert, rigid
 from scapo.method import changes
+from scapo.ranges import Share
 from scapo.records import take
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import UNNAMED, SearchConfig
@@ -62,7 +63,7 @@ CHUNK = 64  # Views, and as many times 16 points, that are compared at once
 class LabelledConfig(SearchConfig):
     """A bound: template registration with the template of true placements, all labels."""
 
-    trusted: float = 1.0
+    trusted: Share = 1.0
     """Share of the learned clouds, those that the template explains best, that tell states, cameras
     and looks, all true, and of the placed ones from which the network learns."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +20,7 @@ from scapo.equivariant.epn import PointConv, SeparableBlock
 from scapo.equivariant.layers import ChannelNorm, anchor_coordinates, leaky
 from scapo.equivariant.levels import LevelConfig, Neighbourhood, levels
 from scapo.geometry.numerics import at_least_float32
+from scapo.ranges import Neighbours, Positive
 
 SLOPE = 0.01
 """Of the leaky ReLUs."""
@@ -29,11 +30,13 @@ SLOPE = 0.01
 class EncoderConfig:
     """Sizes of an EPN encoder, which keeps all points."""
 
+    LIKE: ClassVar[tuple[tuple[str, ...], ...]] = (("channels", "radii"),)
+
     channels: tuple[int, ...] = (64, 128, 512)
     """Channels of each block."""
-    radii: tuple[float, ...] = (0.08, 0.16, 0.226)
+    radii: tuple[Positive, ...] = (0.08, 0.16, 0.226)
     """0.2 x 0.4 x (1, 2, 2.83) where the box's diagonal is 1; mean radius 0.25 is about that."""
-    neighbours: int = 64
+    neighbours: Neighbours = 64
     """Most points of a neighbourhood."""
     recompute: bool = False
     """Compute correlations twice rather than keep them: less memory, more time."""

@@ -37,6 +37,7 @@ from scapo.method import (
 )
 from scapo.paper.heads import thin
 from scapo.pictures import Panel, PictureData
+from scapo.ranges import Share
 from scapo.types import Joints, Labels, Observation, Prediction
 
 WHOLE, PARTS, USUAL = "whole", "parts", "usual"
@@ -86,7 +87,7 @@ class EapConfig:
     """Learning rate at the start."""
     min_lr: float = 1e-7
     """Least learning rate."""
-    decay: float = 0.64
+    decay: Share = 0.64
     """Factor of the learning rate every `decay_every` epochs: published, 0.7 every 1,000 steps of
     8 clouds, is this where there are 5,000 of them."""
     decay_every: int | None = 2

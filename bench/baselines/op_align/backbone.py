@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -14,6 +15,7 @@ from scapo.equivariant.e2pn import QuotientBlock, to_rotations
 from scapo.equivariant.layers import ChannelNorm, PointPool
 from scapo.equivariant.levels import LevelConfig, Sampling, levels
 from scapo.paper.heads import thin
+from scapo.ranges import Neighbours, Positive
 
 SLOPE = 0.01
 """Of the leaky ReLUs."""
@@ -23,14 +25,16 @@ SLOPE = 0.01
 class BackboneConfig:
     """Sizes of the equivariant backbone; defaults as published."""
 
+    LIKE: ClassVar[tuple[tuple[str, ...], ...]] = (("channels", "depth"),)
+
     channels: tuple[int, ...] = (32, 64, 128, 256)
     """Channels of each group; every group keeps one point of two."""
     depth: tuple[int, ...] = (2, 2, 2, 1)
     """Convolutions of each group."""
-    radius: float = 0.2
+    radius: Positive = 0.2
     """Radius of the first convolution's neighbourhoods; times the square root of 2 with every
     halving."""
-    neighbours: int = 32
+    neighbours: Neighbours = 32
     """Most neighbours of the first convolution of a group, half as many of the others."""
     points: int | None = None
     """Points it looks at, evenly taken from the cloud's order; None = all."""

@@ -42,6 +42,7 @@ from scapo.paper.heads import JointPairs, thin
 from scapo.paper.losses import labelled, shape_variance, state_gauge
 from scapo.paper.skinning import cross_maps, part_maps
 from scapo.pictures import Panel, PictureData
+from scapo.ranges import Neighbours, Share
 from scapo.types import Joints, Labels, Observation, Prediction
 
 GREY = 0.5
@@ -54,11 +55,11 @@ class LossConfig:
 
     reconstruction: float = 10.0
     """Weight of L_rigid and L_art, which share it."""
-    rigid_share: float = 0.5
+    rigid_share: Share = 0.5
     """Share of L_rigid at the beginning, the rest is L_art's; halved with the learning rate."""
     density: float = 200.0
     """Weight of how unevenly the canonical points lie: the variance of neighbour distances."""
-    density_neighbours: int = 64
+    density_neighbours: Neighbours = 64
     """Neighbours of a point that tell how densely it lies."""
     offset: float = 10.0
     """Weight of the decoder's offsets from the base shape."""
@@ -115,7 +116,7 @@ class OpAlignConfig:
     """Width of the uniform noise on axes in training."""
     test_noise: bool = False
     """Noise on axes at test time too, as published."""
-    turned: float = 0.0
+    turned: Share = 0.0
     """Share of the training clouds that are turned at random (published: real data, 0.5)."""
     noise: float = 0.0
     """Noise of coordinates in training, normalised units (published: real data, 1e-3 on half)."""
