@@ -6,6 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from scapo.ranges import Positive, Seed
+
 SplitName = Literal["train", "val", "test", "test-ood"]
 Protocol = Literal["joint", "isolated", "full"]
 Sampling = Literal["random", "fps"]
@@ -24,7 +26,7 @@ class DataOptions:
     """Axis of the URDF's root link that is up, such as z or -y; default: as the source has it."""
     front: str | None = None
     """Axis that a model's front (door, drawer, user side) faces; default: as the source has it."""
-    scale: float | None = None
+    scale: Positive | None = None
     """Scale: metres per unit of the URDF; default: as the source has it."""
     any_model: bool = False
     """Any model: take also one none of whose links, joints or semantics speaks of the category."""
@@ -37,7 +39,7 @@ class DataOptions:
     instances: int | None = None
     """Number of objects that they show; default: one for each 50 samples, or all models of the
     folder."""
-    seed: int = 1
+    seed: Seed = 1
     """Seed of objects, joint states, cameras and points."""
     points: int = 1024
     """Points of a cloud; drawn with replacement where fewer pixels are visible."""

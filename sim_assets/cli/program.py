@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 
 from scapo.interrupt import exit_if_unheard, exit_interrupted
+from scapo.ranges import check_numbers
 from scapo.text import unknown_word, words_of
 from sim_assets.cli.console import say
 from sim_assets.cli.verbs import VERBS, UsageError
@@ -43,6 +44,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
             args=words,
             config=(tyro.conf.OmitArgPrefixes,),
         )
+        check_numbers(command)
         sys.exit(command.run(console))
     except MemoryError as error:
         say(errors, f"scapo-data: expected enough memory, found: {error}")

@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from scapo.categories import CATEGORIES, Category
+from scapo.ranges import CountOrNone, Port, Positive, Range, Seed
 from scapo.text import did_you_mean
 from sim_assets.cli.console import progress_bar, say, say_each, show_made
 from sim_assets.options import DataOptions
@@ -27,6 +28,8 @@ else:
     CategoryName = Literal[tuple(CATEGORIES)]
 NameOfAny = Annotated[str, tyro.conf.arg(metavar="{" + ",".join([*CATEGORIES, "..."]) + "}")]
 """One of the package's categories or of a file's."""
+MOST_POINTS = 1 << 24
+"""`scapo.store.manifest.MAX_POINTS`, written out: that module takes time to import."""
 
 
 class UsageError(ValueError):
@@ -75,7 +78,7 @@ class Build:
     """Folder for the assets."""
     count: int = 10
     """Number of instances."""
-    seed: int = 1
+    seed: Seed = 1
     """Seed of the shapes."""
     split: Literal["train", "val", "test", "test-ood"] = "train"
     """Split of the instances; splits share none."""
@@ -111,11 +114,11 @@ class Check:
     """Axis of the URDF's root link that is up, such as z or -y."""
     front: str | None = None
     """Axis that the front faces."""
-    scale: float | None = None
+    scale: Positive | None = None
     """Scale: metres per unit of the URDF."""
     any_model: bool = False
     """Any model: with a category, accept also those none of whose names speaks of it."""
-    workers: int = os.cpu_count() or 1
+    workers: CountOrNone = os.cpu_count() or 1
     """Worker processes."""
 
     def run(self, console: Console) -> int:
@@ -159,13 +162,13 @@ class Generate:
     """Categories of your own, a TOML file (docs/categories.md); it takes --source with models. The
     data carry the definition, so that no later command asks for the file."""
     data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
-    workers: int | None = None
+    workers: CountOrNone | None = None
     """Worker processes; by default as many as pay, one per core at most, and one at least for
     models of a folder. 0: work in this process, unprotected against objects that crash or hang."""
     engine: Literal["local", "ray"] = "local"
     """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
     (docs/cluster.md)."""
-    timeout: float = 300.0
+    timeout: Positive = 300.0
     """Seconds without a sign of life after which an object counts as hanging and is left out."""
     strict: bool = False
     """Stop at the first object that fails."""
@@ -213,12 +216,12 @@ class Benchmark:
     Their category is told by PATH/index.csv, by themselves, or by the folder."""
     backend: Literal["auto", "sapien", "raycast"] = "sapien"
     """Renderer; the published digests are SAPIEN's."""
-    workers: int | None = None
+    workers: CountOrNone | None = None
     """Worker processes; by default as many as pay, one per core at most."""
     engine: Literal["local", "ray"] = "local"
     """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
     (docs/cluster.md)."""
-    timeout: float = 300.0
+    timeout: Positive = 300.0
     """Seconds without a sign of life after which an object counts as hanging and is left out."""
     strict: bool = False
     """Stop at the first object that fails."""
@@ -274,7 +277,7 @@ class Import:
     """Folder of the set, or one above or within it."""
     out: Path
     """Folder for what is made."""
-    points: int = 1024
+    points: Annotated[int, Range(1, MOST_POINTS)] = 1024
     """Points of a cloud; drawn with replacement where a file has fewer."""
     strict: bool = False
     """Stop at the first file that cannot be used."""
@@ -345,7 +348,7 @@ class View:
 
     path: tyro.conf.Positional[Path]
     """A data set, or a category or split of one."""
-    port: int = 8080
+    port: Port = 8080
     """Port to listen at; the next free one is taken if it is in use."""
     host: str = "localhost"
     """Address to listen at; 0.0.0.0 lets other machines in."""
@@ -422,7 +425,7 @@ class Actuate:
     """Source of the objects: the folder of models that the set was made from."""
     limit: int | None = None
     """Try only the first so many samples."""
-    workers: int | None = None
+    workers: CountOrNone | None = None
     """Worker processes; by default one per core. 0: work in this process."""
 
     def run(self, console: Console) -> int:

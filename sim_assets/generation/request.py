@@ -22,6 +22,7 @@ from sim_assets.sampling.samples import Settings
 SAMPLES_PER_INSTANCE = 50
 """By default, as the benchmark's training split (docs/benchmark.md)."""
 MIN_IMAGE, MAX_IMAGE = 32, 4096
+LEAST_POINTS = 8
 
 
 def make_request(
@@ -142,18 +143,21 @@ def _check(options: DataOptions) -> None:
         ("count", options.count, 1),
         ("instances", options.instances, 1),
         ("seed", options.seed, 0),
-        ("points", options.points, 8),
+        ("points", options.points, LEAST_POINTS),
         ("states_per_view", options.states_per_view, 1),
         ("image_size", options.image_size, MIN_IMAGE),
     )
     for name, value, minimum in least:
         if value is not None and value < minimum:
             raise ValueError(f"{name}: expected {minimum} or more, found {value}")
-    most = MAX_POINTS // options.states_per_view  # a shard holds whole views
-    if options.points > most:
-        raise ValueError(f"points: expected {most} or less, found {options.points}")
-    if options.image_size is not None and options.image_size > MAX_IMAGE:
-        raise ValueError(f"image_size: expected {MAX_IMAGE} or less, found {options.image_size}")
+    most: Sequence[tuple[str, int | None, int]] = (
+        ("states_per_view", options.states_per_view, MAX_POINTS // LEAST_POINTS),
+        ("points", options.points, MAX_POINTS // options.states_per_view),  # whole views a shard
+        ("image_size", options.image_size, MAX_IMAGE),
+    )
+    for name, value, maximum in most:
+        if value is not None and value > maximum:
+            raise ValueError(f"{name}: expected {maximum} or less, found {value}")
     if options.instances is not None and options.instances > options.count:
         raise ValueError(
             f"instances: expected at most count, {options.count}, found {options.instances}"

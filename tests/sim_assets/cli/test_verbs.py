@@ -20,8 +20,9 @@ from rich.console import Console
 
 from scapo.categories import CATEGORIES
 from scapo.store import open_split, write_bytes
+from scapo.store.manifest import MAX_POINTS
 from sim_assets.cli import verbs
-from sim_assets.cli.verbs import VERBS, Benchmark
+from sim_assets.cli.verbs import MOST_POINTS, VERBS, Benchmark
 from sim_assets.generation import benchmark
 from sim_assets.generation.benchmark import pieces
 from sim_assets.importers import op_align_light
@@ -115,7 +116,15 @@ def test_wrong_usage_ends_2(arguments, capsys):
         (("generate", "laptop", "--workers", -1), "workers: expected 0 or more, found -1"),
         (("info", "/no/such"), "/no/such: expected a data set (manifest.json), found none"),
         (("check", "/no/such"), "/no/such: expected a folder or a .urdf file, found nothing"),
-        (("build", "laptop", "--count", 0), "count: expected at least 1, found 0"),
+        (("build", "laptop", "--count", 0), "count: expected 1 or more, found 0"),
+        (("build", "laptop", "--seed", -1), "seed: expected 0 or more, found -1"),
+        (("check", "x", "--scale", "nan"), "scale: expected a finite number above 0, found nan"),
+        (("generate", "laptop", "--seed", 2**63), "seed: expected 0 to 9223372036854775807"),
+        (("generate", "laptop", "--timeout", "nan"), "timeout: expected a finite number above 0"),
+        (("generate", "laptop", "--timeout", 0), "timeout: expected a finite number above 0"),
+        (("benchmark", "sim-art/2", "--workers", -1), "workers: expected 0 or more, found -1"),
+        (("benchmark", "sim-art/2", "--timeout", -1), "timeout: expected a finite number above 0"),
+        (("import", "hoi4d", "x", "--points", 2**25), "points: expected 1 to 16777216, found"),
     ],
 )
 def test_bad_input_ends_1_with_one_line(arguments, message, tmp_path, capsys):
@@ -334,3 +343,7 @@ def test_wrong_usage_of_import(tmp_path: Path):
     assert run("import", "modelnet", tmp_path, "--out", tmp_path) == 2
     assert run("import", "hoi4d", tmp_path) == 2
     assert run("import", "hoi4d", tmp_path / "none", "--out", tmp_path) == 1
+
+
+def test_a_bound_that_is_written_out_is_that_of_the_store():
+    assert MOST_POINTS == MAX_POINTS

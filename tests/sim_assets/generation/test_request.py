@@ -35,6 +35,10 @@ def test_options_out_of_range_are_refused():
             {"points": 2**23 + 1, "states_per_view": 2},
             "points: expected 8388608 or less, found 8388609",
         ),
+        (
+            {"states_per_view": 2**22, "count": 2**22},
+            "states_per_view: expected 2097152 or less, found 4194304",
+        ),
         ({"instances": 31}, "instances: expected at most count, 30, found 31"),
         ({"states_per_view": 4}, "count: expected a multiple of states_per_view, 4, found 30"),
         ({"image_size": 5000}, "image_size: expected 4096 or less, found 5000"),
