@@ -21,6 +21,7 @@ HEADER = 1 << 16
 """Bytes within which a header must end."""
 DATA = re.compile(rb"(?m)^DATA[ \t]+(\w+)[ \t]*\r?\n")
 KINDS = {"F": "f", "U": "u", "I": "i"}
+XYZ = ("x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,12 +62,12 @@ def read_pcd(path: Path) -> PcdCloud:
     header = _header(path, data[: found.start()], found[1].decode())
     check_count(str(path), header.count)
     columns = _columns(path, header, memoryview(data)[found.end() :])
-    missing = [name for name in "xyz" if name not in columns]
+    missing = [name for name in XYZ if name not in columns]
     if missing:
         raise InputError(
             f"{path}: expected fields x y z, found {' '.join(header.names)[:200] or 'none'}"
         )
-    points = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
+    points = np.stack([columns[name].astype(np.float64) for name in XYZ], 1)
     place = np.array(header.viewpoint[:3])
     return PcdCloud(
         points=points,
@@ -91,8 +92,11 @@ def _header(path: Path, text: bytes, data: str) -> _Header:
             1 if "POINTS" in words else int(height)
         )
         view = tuple(float(value) for value in words.get("VIEWPOINT", ["0"] * 7))
-        if len(types) != len(names) or count < 0 or not np.isfinite(view).all():
+        odd = [n for n, c in zip(names, counts, strict=True) if c < 1 or (c > 1 and n in XYZ)]
+        if len(types) != len(names) or count < 0 or odd:
             raise ValueError("fields, types and counts that do not fit")
+        if len(view) < 3 or not np.isfinite(view).all():
+            raise ValueError(f"VIEWPOINT {' '.join(words['VIEWPOINT'])}")
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: expected a PCD header with FIELDS, SIZE, TYPE and POINTS, found {error}"
@@ -136,7 +140,7 @@ def _ascii(path: Path, header: _Header, body: memoryview) -> dict[str, np.ndarra
     starts = np.cumsum([0, *widths[:-1]])
     where = {name: int(i) for name, i in reversed(list(zip(header.names, starts, strict=True)))}
     wanted = [name for name in ("x", "y", "z", "rgb", "rgba") if name in where]
-    if header.count == 0:
+    if header.count == 0 or not wanted:
         return {name: np.zeros(0) for name in wanted}
     try:
         with warnings.catch_warnings():

@@ -72,6 +72,7 @@ def find_inputs(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
+@np.errstate(all="ignore")  # numbers that are none are left out, and counted in `warnings`
 def read_input(path: Path, options: ReadOptions) -> Cloud:
     """The object's cloud of one file.
 
@@ -152,10 +153,11 @@ def _read_npz(
                 for name in ("points", "color", "sensor")
                 if name in names
             }
-    except (zipfile.BadZipFile, EOFError, ValueError, OSError, RuntimeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path}: expected a readable .npz file, found {error}") from error
+    except InputError:
+        raise
+    except Exception as error:  # whatever zip, zlib and numpy meet in a broken file
+        words = f"{type(error).__name__}: {error}"
+        raise InputError(f"{path}: expected a readable .npz file, found {words}") from error
     points, color, sensor = (arrays.get(name) for name in ("points", "color", "sensor"))
     if points is None or points.ndim != 2 or points.shape[1] != 3:
         there = ", ".join(names[:9]) or "none"

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from bench.infer.cloud import InputError
-from bench.infer.depth import companions, read_depth, read_intrinsics
+from bench.infer.depth import companions, depth_in_metres, read_depth, read_intrinsics
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = "60,62,33,23.5"
@@ -153,3 +155,15 @@ def test_what_lies_beside_an_image_belongs_to_it(tmp_path):
     (tmp_path / "a.mask.png").touch()
     assert companions(image).intrinsics == str(tmp_path / "a.json")
     assert companions(image).mask == tmp_path / "a.mask.png"
+
+
+def test_a_tag_that_nobody_asks_about_says_nothing_on_stderr(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    Image.fromarray(np.full((40, 50), 1.5, np.float32)).save(path)
+    data = bytearray(path.read_bytes())
+    place = int.from_bytes(data[4:8], "little")
+    last = place + 2 + 12 * (int.from_bytes(data[place : place + 2], "little") - 1)
+    data[last + 4 : last + 8] = b"\xff\xff\0\0"  # values of the last tag: more than the file holds
+    path.write_bytes(data)
+    with contextlib.suppress(InputError):  # as Pillow likes
+        depth_in_metres(path, None)

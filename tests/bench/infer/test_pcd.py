@@ -47,6 +47,11 @@ def body(data: str, fields: str = "x y z rgb") -> bytes:
     return np.array([len(small), len(plain)], "<u4").tobytes() + small
 
 
+def counted(counts: str) -> bytes:
+    """With a line on how many values each field has."""
+    return pcd("binary", bytes(999)).replace(b"WIDTH", b"COUNT " + counts.encode() + b"\nWIDTH")
+
+
 @pytest.mark.parametrize("fields", ["x y z rgb", "x y z rgba"])
 @pytest.mark.parametrize("data", ["ascii", "binary", "binary_compressed"])
 def test_every_kind_gives_points_and_colours(data, fields, tmp_path):
@@ -83,6 +88,11 @@ def test_fields_in_another_order_and_a_sensor_elsewhere(tmp_path):
         (pcd("binary", b"", count=10**12), "at most 50,000,000 points"),
         (pcd("binary", b"", count=-1), "expected a PCD header with FIELDS"),
         (pcd("binary", bytes(48), fields="a b c d"), "expected fields x y z, found a b c d"),
+        (pcd("ascii", b"1 2 3 4\n" * 3, fields="a b c d"), "expected fields x y z, found a b c d"),
+        (pcd("binary", body("binary"), extra="1"), "found VIEWPOINT 1$"),
+        (counted("3 1 1 1"), "types and counts that do not fit"),
+        (counted("1 1 1 0"), "types and counts that do not fit"),
+        (counted("1 1 1 -1"), "types and counts that do not fit"),
         (b"FIELDS x y z\nDATA binary\n", "expected a PCD header with FIELDS"),
     ],
 )

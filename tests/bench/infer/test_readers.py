@@ -81,6 +81,23 @@ def zipped(**entries: bytes) -> bytes:
     return buffer.getvalue()
 
 
+def bare() -> bytes:
+    """An archive whose entry lacks the suffix of an array."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("points", b"none")
+    return buffer.getvalue()
+
+
+def damaged() -> bytes:
+    """A packed array of which the middle is lost."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, points=POINTS)
+    data = bytearray(buffer.getvalue())
+    data[200:600] = bytes(400)
+    return bytes(data)
+
+
 BROKEN = {
     "short.ply": (ply()[:-100], "expected a readable PLY file"),
     "rows.ply": (ply("ascii")[:-400], "expected (300 vertices|a readable PLY)"),
@@ -98,6 +115,9 @@ BROKEN = {
     "wide.npz": (zipped(points=header("(100, 900000000000)")), "three numbers a row"),
     "pickle.npz": (zipped(points=header("(100, 3)", "|O")), "expected numbers"),
     "lies.npz": (zipped(points=header("(100, 3)")), "expected a readable .npz"),
+    "torn.npz": (zipped(points=b"\x93NUMPY\x01\x00\x10\x00{'descr':'<f4'  "), "a readable .npz"),
+    "bare.npz": (bare(), "expected a readable .npz"),
+    "packed.npz": (damaged(), "expected a readable .npz"),
     "other.npz": (npz(xyz=POINTS, rgb=COLOR), r"array points of shape \(N, 3\), found xyz, rgb$"),
     "nothing.npz": (zipped(), r"an array points of shape \(N, 3\), found none$"),
     "flat.npz": (npz(points=POINTS[:, :2]), r"found one of shape \(300, 2\)"),
@@ -117,6 +137,16 @@ def test_what_is_broken_is_named(name, tmp_path):
     with pytest.raises(InputError, match=message) as refused:
         read_input(path, ReadOptions())
     assert str(path) in str(refused.value)
+
+
+def test_numbers_too_large_for_their_type_are_left_out_without_a_word_on_stderr(tmp_path):
+    few = POINTS.astype(np.float16)
+    few[:3] = np.float16(np.inf)
+    path = tmp_path / "half.npz"
+    path.write_bytes(npz(points=few))
+    cloud = read_input(path, ReadOptions())
+    assert len(cloud.points) == len(POINTS) - 3
+    assert "3 of 300 points left out" in cloud.warnings[0]
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
