@@ -34,6 +34,8 @@ def act(job: tuple[str, int], report) -> object:
         for _ in range(8):
             time.sleep(0.25)
             report("tick", 0)
+    if verb == "held":
+        return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
     if verb == "environment":
         return {name: os.environ.get(name) for name in ONE_THREAD}
     return number**2
@@ -211,3 +213,10 @@ def test_processor_time_is_that_of_the_process():
         sum(range(1000))
     assert 0.2 < _processor_seconds(os.getpid()) - ours < 10
     assert _processor_seconds(2**30) == 0.0
+
+
+def test_no_interrupt_reaches_a_worker_however_early_it_comes():
+    """What a process is started with holds before its first line of Python."""
+    with Pool(1) as pool:
+        assert [outcome.result for outcome in pool.run(act, [("held", 0)])] == [True]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
