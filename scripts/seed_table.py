@@ -52,7 +52,7 @@ def keep(archive: Path, outs: list[Path]) -> int:
     """Add reports of plain scores to the archive, and say how many it holds."""
     held = reports_of(archive)
     for out in outs:
-        found = [p for p in (out / "scores").rglob("*.json") if p.name.count(".") == 1]
+        found = [p for p in (out / "scores").glob("*/*.json") if p.name.count(".") == 1]
         if not found:
             raise ValueError(f"{out}: expected scores/PART/*.json, found none")
         held |= {path.relative_to(out / "scores").as_posix(): path.read_bytes() for path in found}

@@ -59,8 +59,8 @@ class ScapoConfig:
     supervision: tuple[Literal["segmentation", "joint", "instance"], ...] = ()
     """Labels that training may see: segmentation and joint in Table 2; instance where the run in
     `start` was told which clouds show the same object."""
-    epochs: Annotated[tuple[int, ...], Range(1, MOST, many=(1, 2))] = (200, 200)
-    """Epochs of each stage; one number for both."""
+    epochs: Annotated[tuple[int, ...], Range(0, MOST, many=(1, 2))] = (200, 200)
+    """Epochs of each stage; one number for both. A stage of none is left out."""
     lr: tuple[float, float] = (1e-3, 1e-4)
     """Learning rate at the start of each stage."""
     min_lr: float = 1e-6
