@@ -23,7 +23,12 @@ from scapo.pictures import PictureData
 from scapo.records import cat, map_tensors, take, without_autograd
 from scapo.registered.axis_deviation import refine_deviations
 from scapo.registered.config import DISSENT, SearchConfig
-from scapo.registered.decode import lying_rest, metric_limits, nearest_weights
+from scapo.registered.decode import (
+    lying_rest,
+    metric_limits,
+    nearest_weights,
+    placed_prediction,
+)
 from scapo.registered.discovery import Discovery
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
@@ -239,23 +244,16 @@ class AbstractRegistered(AbstractMethod):
             generator: On the host.
         """
 
-    @abstractmethod
-    def _prediction(
-        self,
-        placement: Placement,
-        rest: Float[Tensor, "B J"],
-        part_weight: Float[Tensor, "B N P"],
-        similarity: Similarity,
-        confidence: Float[Tensor, " B"],
-    ) -> Prediction:
-        """What a placement in normalised frames stands for, its states counted from `rest`."""
-
     def _rest(self, placement: Placement) -> Float[Tensor, "B J"]:
         """States at which a part's frame is the base's: nobody knows at which the parts were made.
 
         The template has them anywhere in their range, and stretches them as they lie there.
         """
         return lying_rest(self.template, placement)
+
+    def _origin(self) -> Float[Tensor, " 3"]:
+        """The template's point at which part frames sit: the middle of its base."""
+        return self.template.part_centres()[0]
 
     def _inlier_mask(self, cloud: Float[Tensor, "B N 3"]) -> Bool[Tensor, "B N"]:
         """Which points belong to the object; all where outliers are kept."""
@@ -405,13 +403,13 @@ class AbstractRegistered(AbstractMethod):
         similarity: Similarity,
         confidence: Float[Tensor, " B"],
     ) -> Prediction:
-        """`_prediction`, with the states that were seen in training as limits."""
-        rest = self._rest(placement)
-        plain = self._prediction(placement, rest, part_weight, similarity, confidence)
-        if not bool((self.pseudo.trust > 0).any()):  # not trained yet
-            return plain
-        limits = metric_limits(self.template, self._limits(), rest, similarity)
-        return replace(plain, joint_limits=limits)
+        """What a placement stands for, with the states that were seen in training as limits."""
+        rest, origin = self._rest(placement), self._origin()
+        plain = placed_prediction(self.template, placement, rest, origin, part_weight, similarity)
+        limits = None
+        if bool((self.pseudo.trust > 0).any()):  # else it is not trained yet
+            limits = metric_limits(self.template, self._limits(), rest, similarity)
+        return replace(plain, joint_limits=limits, confidence=confidence)
 
     def _camera(
         self, observation: Observation, similarity: Similarity, kept: Float[Tensor, "B K 3"]

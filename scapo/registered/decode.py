@@ -22,9 +22,9 @@ def placed_prediction(
     template: ArticulatedTemplate,
     placement: Placement,
     rest: Float[Tensor, "B J"],
+    origin: Float[Tensor, " 3"],
     part_weight: Float[Tensor, "B N P"],
     similarity: Similarity,
-    confidence: Float[Tensor, " B"],
 ) -> Prediction:
     """The prediction that a placement in normalised frames stands for.
 
@@ -34,12 +34,12 @@ def placed_prediction(
         template: The category's.
         placement: Of each cloud.
         rest: States at which the frames of a part and the base are the same (`lying_rest`).
+        origin: The template's point at which part frames sit, in its own size.
         part_weight: Of the points.
         similarity: The normalisation to undo.
-        confidence: Handed on.
     """
     poses = part_frames(template, placement, rest)
-    origin = template.part_centres()[0] * placement.log_scale.exp()
+    origin = origin * placement.log_scale.exp()
     move = (poses.rotation @ origin[:, None, :, None])[..., 0] + poses.translation
     pivot, axis = template.joints_in_view(placement)
     metric = placement.state / similarity.scale[:, None]
@@ -53,7 +53,6 @@ def placed_prediction(
         canonical_points=(shape - origin[:, None]) / similarity.scale[:, None, None],
         canonical_normals=normals,
         canonical_part=part.expand(len(shape), -1),
-        confidence=confidence,
     )
 
 

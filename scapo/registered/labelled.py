@@ -25,13 +25,12 @@ from torch import Tensor
 
 from scapo.categories import JointKind
 from scapo.geometry.points import Similarity, ends, nearest
-from scapo.geometry.rigid import apply, invert, rigid
+from scapo.geometry.rigid import apply, invert
 from scapo.method import changes
 from scapo.ranges import Share
 from scapo.records import take
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import UNNAMED, SearchConfig
-from scapo.registered.decode import canonical_surface, part_frames, placed_prediction
 from scapo.registered.discovery import Discovery
 from scapo.registered.pose_refinement import RANKED, backward_weight
 from scapo.registered.pose_search import SearchResult
@@ -44,7 +43,7 @@ from scapo.registered.template import (
 )
 from scapo.registered.view_loss import view_loss
 from scapo.registered.views import PartialViews
-from scapo.types import Labels, Observation, Prediction, Supervision
+from scapo.types import Labels, Observation, Supervision
 
 logger = logging.getLogger(__name__)
 
@@ -105,25 +104,9 @@ class LabelledRegistered(AbstractRegistered):
         """The template's own: it is the mean of the objects as they are made, and stretches so."""
         return self.template.rest.expand_as(placement.state)
 
-    def _prediction(
-        self,
-        placement: Placement,
-        rest: Float[Tensor, "B J"],
-        part_weight: Float[Tensor, "B N P"],
-        similarity: Similarity,
-        confidence: Float[Tensor, " B"],
-    ) -> Prediction:
-        """Part frames are the object's at rest."""
-        plain = placed_prediction(
-            self.template, placement, rest, part_weight, similarity, confidence
-        )
-        poses = part_frames(self.template, placement, rest)
-        scale = similarity.scale[:, None, None]
-        return replace(
-            plain,
-            camera_T_part=similarity.inverse_pose(rigid(poses.rotation, poses.translation)),
-            canonical_points=canonical_surface(self.template, placement, rest)[0] / scale,
-        )
+    def _origin(self) -> Float[Tensor, " 3"]:
+        """Part frames are the object's at rest, and so is the template's."""
+        return torch.zeros_like(self.template.points[0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

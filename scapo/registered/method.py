@@ -32,14 +32,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import Category
-from scapo.geometry.points import Similarity, normalise
+from scapo.geometry.points import normalise
 from scapo.method import ParameterGroup, Stage, Step, changes
 from scapo.records import cat
 from scapo.registered.axis_deviation import square_axes
 from scapo.registered.base import FIRST, LATE, PLACING, AbstractRegistered
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
 from scapo.registered.course import plan_of
-from scapo.registered.decode import placed_prediction
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.gauge import settle_hinges
 from scapo.registered.halves import cut_by_mirror
@@ -68,7 +67,7 @@ from scapo.store.checkpoint import (
     read_checkpoint,
 )
 from scapo.store.files import StoreError
-from scapo.types import Labels, Observation, Prediction, Supervision
+from scapo.types import Labels, Observation, Supervision
 
 logger = logging.getLogger(__name__)
 
@@ -300,19 +299,6 @@ class TemplateRegistration(AbstractRegistered):
         """Clouds of one object, normalised all alike: it is as large in all of them."""
         similarity, views, _ = self._observed(cloud)
         return views.scaled(similarity.scale.median() / similarity.scale)
-
-    def _prediction(
-        self,
-        placement: Placement,
-        rest: Float[Tensor, "B J"],
-        part_weight: Float[Tensor, "B N P"],
-        similarity: Similarity,
-        confidence: Float[Tensor, " B"],
-    ) -> Prediction:
-        """Part frames sit at the middle of the template's base."""
-        return placed_prediction(
-            self.template, placement, rest, part_weight, similarity, confidence
-        )
 
 
 def load_run(name: str | Path, category: Category) -> TemplateRegistration:

@@ -72,8 +72,9 @@ class Told(AbstractMethod):
         normals = surface_normals(points, points, camera)
         weight = nearest_weights(self.template, points, normals, placement)
         sure = torch.tensor([0.1 if int(r) in self.wrong else 0.9 for r in row])
-        rest = torch.zeros_like(placement.state)
-        return placed_prediction(self.template, placement, rest, weight, similarity, sure)
+        rest, origin = torch.zeros_like(placement.state), self.template.part_centres()[0]
+        plain = placed_prediction(self.template, placement, rest, origin, weight, similarity)
+        return replace(plain, confidence=sure)
 
     @property
     def variant(self) -> str:

@@ -73,7 +73,8 @@ def test_parts_and_joint_of_a_prediction_belong_together(
         elsewhere = torch.tensor([0.07, -0.02, 0.05])
         placement = replace(placement, pivot=shape.pivots(placement) + elsewhere)
     weight, rest = torch.full((3, 50, 2), 0.5), lying_rest(shape, placement)
-    found = placed_prediction(shape, placement, rest, weight, similarity, torch.ones(3))
+    origin = shape.part_centres()[0]
+    found = placed_prediction(shape, placement, rest, origin, weight, similarity)
     assert found.camera_T_part is not None
     assert found.joints is not None
     base, lid = found.camera_T_part.unbind(1)
@@ -118,7 +119,8 @@ def test_a_part_is_posed_as_it_lies_where_the_object_is_stretched(angle: float):
     assert not lying_rest(shape, still).abs().max() > 1e-6
     _, similarity = normalise(torch.randn(3, 50, 3, generator=generator(0)))
     weight = torch.full((3, 50, 2), 0.5)
-    found = placed_prediction(shape, placement, rest, weight, similarity, torch.ones(3))
+    origin = shape.part_centres()[0]
+    found = placed_prediction(shape, placement, rest, origin, weight, similarity)
     assert found.camera_T_part is not None
     closed = found.camera_T_part[:, 1, :3, :3] @ rotvec_to_rotmat(angle * AXIS)
     flap = shape.logit.argmax(-1) == 1
