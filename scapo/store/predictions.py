@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Num
@@ -117,82 +117,33 @@ def read_prediction_header(path: Path) -> Header:
         ) from error
     if entries != ["scapo"]:
         raise StoreError(f"{path}: expected the one metadata entry 'scapo', found {entries}")
-    digests = [record[key] for key in DIGEST_KEYS if key in record]
-    if not digests:
-        raise StoreError(f"{path}: header field {DIGEST_KEYS[0]!r}: expected text, found none")
-    seed = record.get("seed")
-    if isinstance(seed, bool) or not isinstance(seed, int) or abs(seed) >= 2**63:
-        raise StoreError(f"{path}: header field 'seed': expected an integer, found {_shown(seed)}")
-    category = _text(path, record, "category")
-    known = defined(record, category, f"{path}: header")
-    return Header(
-        method=_text(path, record, "method"),
-        variant=_text(path, record, "variant", empty=True),
-        category=category,
-        split=_text(path, record, "split"),
-        seed=seed,
-        data_digest=_text(path, {DIGEST_KEYS[0]: digests[0]}, DIGEST_KEYS[0]),
-        supervision=_supervision(path, record),
-        camera=_camera(path, record),
-        budget=_object(path, record, "budget"),
-        run=_object(path, record, "run"),
+    where = f"{path}: header"
+    digest = next((record[key] for key in DIGEST_KEYS if key in record), None)
+    fields = {**record, "data_digest": digest, "definition": None}
+    header = from_json(Header, fields, where, link=" field ")
+    _check_fields(where, header)
+    known = defined(record, header.category, where)
+    return replace(
+        header,
+        supervision=tuple(sorted(set(header.supervision))),
         definition=None if known is None else foreign(known),
-        object_frame=_object_frame(path, record),
     )
 
 
-def _object_frame(path: Path, record: dict[str, Any]) -> ObjectFrame | None:
-    where = f"{path}: header field 'object_frame'"
-    value = record.get("object_frame")
-    if value is None:
-        return None
-    found = from_json(ObjectFrame, value, where)
-    if sorted(found.order) != list(range(len(found.order))):
-        raise StoreError(f"{where}: order: expected every part once, found {found.order}")
-    return found
-
-
-def _camera(path: Path, record: dict[str, Any]) -> bool | None:
-    value = record.get("camera")
-    if value is not None and not isinstance(value, bool):
-        raise StoreError(
-            f"{path}: header field 'camera': expected true or false, found {_shown(value)}"
-        )
-    return value
-
-
-def _object(path: Path, record: dict[str, Any], name: str) -> dict[str, Any]:
-    value = record.get(name, {})
-    if not isinstance(value, dict):
-        found = _shown(value)
-        raise StoreError(f"{path}: header field {name!r}: expected an object, found {found}")
-    return value
-
-
-def _shown(value: object) -> str:
-    return "none" if value is None else repr(value)[:LONGEST_NAME]
-
-
-def _text(path: Path, record: dict[str, Any], name: str, *, empty: bool = False) -> str:
-    value = record.get(name)
-    if not isinstance(value, str) or not (value or empty) or not value.isprintable():
-        raise StoreError(f"{path}: header field {name!r}: expected text, found {_shown(value)}")
-    if len(value) > LONGEST_NAME:
-        raise StoreError(
-            f"{path}: header field {name!r}: expected at most {LONGEST_NAME} characters, "
-            f"found {len(value)}"
-        )
-    return value
-
-
-def _supervision(path: Path, record: dict[str, Any]) -> tuple[Supervision, ...]:
-    value, known = record.get("supervision"), get_args(Supervision)
-    if not isinstance(value, list) or any(item not in known for item in value):
-        raise StoreError(
-            f"{path}: header field 'supervision': expected a list of "
-            f"{', '.join(known)}, found {_shown(value)}"
-        )
-    return tuple(sorted(set(value)))
+def _check_fields(where: str, header: Header) -> None:
+    """Beyond their types: texts that can be shown, a seed and an order that can be."""
+    for name in ("method", "variant", "category", "split", "data_digest"):
+        text = getattr(header, name)
+        if not text.isprintable() or not (name == "variant" or text) or len(text) > LONGEST_NAME:
+            raise StoreError(
+                f"{where} field {name}: expected text of at most {LONGEST_NAME} characters, "
+                f"found {repr(text)[:LONGEST_NAME]}"
+            )
+    if abs(header.seed) >= 2**63:
+        raise StoreError(f"{where} field seed: expected one of 64 bits, found another")
+    order = () if header.object_frame is None else header.object_frame.order
+    if sorted(order) != list(range(len(order))):
+        raise StoreError(f"{where} field object_frame: expected every part once, found {order}")
 
 
 def check_belongs(path: Path, header: Header, manifest: Manifest) -> None:
