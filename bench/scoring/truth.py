@@ -13,26 +13,15 @@ from safetensors import SafetensorError, safe_open
 
 from scapo.store import SAMPLES, Split, StoreError, read_header
 from scapo.store.definitions import known_category
+from scapo.store.files import require
 from scapo.store.manifest import Manifest
-from scapo.store.samples import UNLABELLED
+from scapo.store.schema import ALIKE, TENSORS, UNLABELLED, check_samples
 
 BLOCK = 1024
 """Samples in memory at a time."""
 
-_DTYPES = {
-    "points": "F32",
-    "part": "U8",
-    "camera_T_part": "F32",
-    "joint_pivot": "F32",
-    "joint_axis": "F32",
-    "joint_state": "F32",
-    "visible": "F32",
-    "instance": "I32",
-}
-
-
-_ALIKE = {"alike": "U8", "alike_base": "F32", "alike_state": "F32", "alike_part": "U8"}
-"""Tensors that not every split has."""
+NAMES = tuple(name for name in TENSORS if name != "camera")
+"""What scoring reads of every shard."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,64 +75,40 @@ def blocks(split: Split, size: int = BLOCK) -> Iterator[Truth]:
     """The split's samples in order, at most `size` at a time.
 
     Raises:
-        StoreError: A shard is missing, not what the manifest says, or not finite.
+        StoreError: A shard is missing, or not what the manifest and the layout say.
     """
     for shard in split.manifest.shards:
         path = split.folder / shard.file
-        _check_shard(path, split, shard.count)
+        split.check_header(path, read_header(path, SAMPLES))
         try:
             with safe_open(path, "numpy") as file:
-                there = [*_DTYPES, *(name for name in _ALIKE if name in file.keys())]  # noqa: SIM118
-                slices = {name: file.get_slice(name) for name in there}
+                there = set(file.keys())
+                names = (*NAMES, *(ALIKE if there & {*ALIKE} else ()))
+                require(path, names, there)
+                slices = {name: file.get_slice(name) for name in names}
                 for start in range(0, shard.count, size):
-                    stop = min(start + size, shard.count)
-                    rows = {name: item[start:stop] for name, item in slices.items()}
+                    last = start + size >= shard.count  # with all that there is: check_samples
+                    rows = {n: x[start : None if last else start + size] for n, x in slices.items()}
+                    count = min(size, shard.count - start)
+                    check_samples(path, rows, split.manifest, shard.first + start, count)
                     yield truth_of(path, shard.first + start, rows)
         except SafetensorError as error:
             raise StoreError(f"{path}: expected readable tensors, found {error}") from error
-
-
-def _check_shard(path: Path, split: Split, count: int) -> None:
-    read_header(path, SAMPLES)
-    with safe_open(path, "numpy") as file:
-        names = set(file.keys())
-        wanted = _DTYPES | (_ALIKE if names & _ALIKE.keys() else {})
-        for name, dtype in wanted.items():
-            if name not in names:
-                raise StoreError(f"{path}: expected tensor {name!r}, found none")
-            item = file.get_slice(name)
-            if item.get_dtype() != dtype:
-                raise StoreError(
-                    f"{path}: tensor {name!r}: expected {dtype}, found {item.get_dtype()}"
-                )
-            found = tuple(item.get_shape())
-            expected = split.shapes(count)[name]
-            if found != expected:
-                raise StoreError(
-                    f"{path}: tensor {name!r}: expected shape {expected}, found {found}"
-                )
 
 
 def truth_of(path: Path, first: int, rows: dict[str, np.ndarray]) -> Truth:
     """Samples as they are on disk, from `first` on, as float64 with their scale.
 
     Raises:
-        StoreError: Points that are not finite, or all the same.
+        StoreError: Points that are all the same.
     """
     points = rows["points"]
     centred = points - points.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
     radius = np.sqrt(np.einsum("bnc,bnc->bn", centred, centred)).mean(1, dtype=np.float64)
-    odd = ~np.isfinite(points).all((1, 2))
-    if odd.any():
-        what = "NaN" if np.isnan(points[odd.argmax()]).any() else "infinite coordinates"
+    if not radius.all():
         raise StoreError(
-            f"{path}: sample {first + int(odd.argmax())}: expected finite points, found {what}"
-        )
-    usable = np.isfinite(radius) & (radius > 0)
-    if not usable.all():
-        raise StoreError(
-            f"{path}: sample {first + int(usable.argmin())}: expected finite points "
-            "that differ, found mean radius 0"
+            f"{path}: sample {first + int(radius.argmin())}: expected points that differ, "
+            "found mean radius 0"
         )
     part = rows["part"].astype(np.int16)
     part[part == UNLABELLED] = -1
