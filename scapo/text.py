@@ -6,6 +6,8 @@ What a file says of itself may hold line breaks, escape sequences, markup or a m
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -102,6 +104,17 @@ def as_cell(text: str) -> str:
 def from_cell(cell: str) -> str:
     """The text of a cell that `as_cell` wrote."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
+def csv_text(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    r"""A table as CSV, its heading first.
+
+    >>> csv_text(["a", "b"], [(1, "x,y")])
+    'a,b\n1,"x,y"\n'
+    """
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows([columns, *rows])
+    return buffer.getvalue()
 
 
 def as_markdown(text: str) -> str:

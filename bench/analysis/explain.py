@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -19,6 +17,7 @@ from bench.scoring.truth import blocks
 from bench.statistics import Interval, interval
 from scapo.store.predictions import Predictions
 from scapo.store.provenance import commit
+from scapo.text import csv_text
 
 STRATA_COLUMNS = ("factor", "lower", "upper", "metric", "unit", "samples", "mean", "low", "high",
                   "n", "undefined")  # fmt: skip
@@ -101,17 +100,9 @@ def _fields(value: Interval) -> tuple[object, ...]:
                  for name in ("mean", "low", "high", "count", "undefined"))  # fmt: skip
 
 
-def _csv(columns: Iterable[str], rows: Iterable[tuple[object, ...]]) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return buffer.getvalue()
-
-
 def strata_csv(strata: Iterable[Stratum]) -> str:
     """A row per bin and metric."""
-    return _csv(STRATA_COLUMNS, (
+    return csv_text(STRATA_COLUMNS, (
         (s.factor, s.lower, s.upper, s.metric, s.unit, s.samples, *_fields(s.value))
         for s in strata
     ))  # fmt: skip
@@ -119,7 +110,7 @@ def strata_csv(strata: Iterable[Stratum]) -> str:
 
 def ladder_csv(ladder: Ladder) -> str:
     """A row per rung and metric."""
-    return _csv(LADDER_COLUMNS, (
+    return csv_text(LADDER_COLUMNS, (
         (rung, metric, unit, *_fields(value))
         for rung, values in ladder.items() for (metric, unit), value in values.items()
     ))  # fmt: skip

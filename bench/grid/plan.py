@@ -22,7 +22,7 @@ from bench.methods import METHODS
 from bench.requests import Mode
 from scapo.released import weights
 from scapo.store import StoreError, canonical_json, sha256_bytes, sha256_file, write_bytes
-from scapo.store.json_records import read_json
+from scapo.store.json_records import read_json, readable_json
 from scapo.store.manifest import read_manifest
 from scapo.store.provenance import PACKAGE, commit
 
@@ -384,7 +384,7 @@ def freeze(path: Path, plan: Plan, *, anew: bool = False) -> bool:
     """
     now = plan.to_json()
     if anew or not path.exists():
-        write_bytes(path, (json.dumps(now, indent=1, sort_keys=True) + "\n").encode())
+        write_bytes(path, readable_json(now).encode())
         return True
     there = read_plan(path)
     differs = [name for name in FROZEN if there[name] != now[name]]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,6 +19,7 @@ from bench.scoring.truth import revolute
 from scapo.method import AbstractMethod, Mode, evenly
 from scapo.store import Split, open_split, write_bytes
 from scapo.store.files import Header, require_suffix
+from scapo.store.json_records import readable_json
 from scapo.store.provenance import commit, machine
 from scapo.store.samples import SampleDataset
 from scapo.types import Observation
@@ -58,8 +58,7 @@ def measure_stability(request: StabilityRequest) -> dict[str, Any]:
     report = _about(method, header, split, index, plan) | {
         "modes": measured, "commit": commit(), "machine": machine(device),
     }  # fmt: skip
-    text = json.dumps(report, sort_keys=True, indent=1, allow_nan=False)
-    write_bytes(request.out, (text + "\n").encode())
+    write_bytes(request.out, readable_json(report).encode())
     return report
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import gzip
 import io
-import json
 import os
 import secrets
 import warnings
@@ -27,7 +26,7 @@ from bench.metrics import METRICS
 from bench.scoring.scores import Errors
 from scapo.store import StoreError, sha256_bytes, sha256_file
 from scapo.store.files import require_suffix
-from scapo.store.json_records import from_json, read_json
+from scapo.store.json_records import from_json, read_json, readable_json
 from scapo.store.regular import read_regular
 from scapo.text import as_cell, from_cell
 from scapo.types import Supervision
@@ -235,9 +234,8 @@ def writing(path: Path) -> Iterator[ScoresWriter]:
             yield writer
         record = {"format": FORMAT, **writer.report}
         record["digests"] = {**record["digests"], "scores": sha256_file(scores)}
-        text = json.dumps(record, sort_keys=True, indent=1, allow_nan=False)
         with _creating(report, beside) as raw:
-            raw.write((text + "\n").encode())
+            raw.write(readable_json(record).encode())
         report.replace(beside)
         scores.replace(path)
     finally:

@@ -7,12 +7,10 @@ never markup, formulas or commands.
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 
 from bench.tables.model import DASH, UNCALIBRATED, Cell, Row, Table
-from scapo.text import as_cell, as_markdown
+from scapo.text import as_cell, as_markdown, csv_text
 
 
 def to_markdown(table: Table) -> str:
@@ -65,18 +63,17 @@ COLUMNS = (
 
 def to_csv(table: Table) -> str:
     """One row per cell, values unrounded; empty where there is none."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    columns = [as_cell(name) for name in _column_names(table)]
+    columns, rows = [as_cell(name) for name in _column_names(table)], list[tuple[object, ...]]()
     for block in table.blocks:
         for row in block.rows:
             marks = ("", "", "") if row.marks is None else tuple(map(int, row.marks))
             marks = (*marks, "" if row.camera is None else int(row.camera))
             names = (as_cell(block.heading), as_cell(row.method), row.source)
-            for column, cell in zip(columns, row.cells, strict=True):
-                writer.writerow((table.number, *names, *marks, column, *_values(cell, row.seeds)))
-    return buffer.getvalue()
+            rows += [
+                (table.number, *names, *marks, column, *_values(cell, row.seeds))
+                for column, cell in zip(columns, row.cells, strict=True)
+            ]
+    return csv_text(COLUMNS, rows)
 
 
 def _column_names(table: Table) -> list[str]:

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import get_args
@@ -18,7 +16,7 @@ from bench.scoring.summary import passes
 from bench.statistics import Paired, paired
 from bench.tables.results import Kind, Place, Results, series_of
 from bench.tables.spec import REFERENCE, TABLE_1
-from scapo.text import as_cell
+from scapo.text import as_cell, csv_text
 
 COLUMNS = (
     "data", "category", "metric", "unit", "first", "second", "difference", "low", "high",
@@ -28,9 +26,10 @@ COLUMNS = (
 
 def significance_csv(results: Results, rule: ApRule = "mean") -> str:
     """Second minus first per category and metric, its interval and sign-flip p-value."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    return csv_text(COLUMNS, _rows(results, rule))
+
+
+def _rows(results: Results, rule: ApRule) -> Iterator[tuple[object, ...]]:
     for runs_a, runs_b in _pairs(results):
         first, second = runs_a[0], runs_b[0]
         both = (series_of(first), series_of(second))
@@ -39,9 +38,7 @@ def significance_csv(results: Results, rule: ApRule = "mean") -> str:
         for metric, unit, result in _compared(runs_a, runs_b, rule):
             if result.samples:
                 numbers = (result.difference, result.low, result.high, result.p_value)
-                row = (*place, metric, unit, *names, *map(repr, numbers), result.samples)
-                writer.writerow(row)
-    return buffer.getvalue()
+                yield *place, metric, unit, *names, *map(repr, numbers), result.samples
 
 
 def _pairs(results: Results) -> Iterator[tuple[list[Scores], list[Scores]]]:

@@ -14,7 +14,7 @@ from scapo.store.files import write_bytes
 from scapo.store.json_records import from_json
 from scapo.store.regular import read_regular
 from scapo.store.schema import StoreError
-from scapo.text import as_cell, from_cell
+from scapo.text import as_cell, csv_text, from_cell
 from scapo.types import Supervision
 
 Towards = Literal["open", "closed", ""]
@@ -65,12 +65,8 @@ _NUMBERS = ("moved", "needed", "travel", "off_path_mean", "off_path_peak")
 
 def write_actuations(path: Path, rows: Sequence[Actuation]) -> None:
     """Write the file atomically; the same rows give the same bytes."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for row in rows:
-        writer.writerow([_cell(value) for value in asdict(row).values()])
-    write_bytes(path, buffer.getvalue().encode())
+    cells = (map(_cell, asdict(row).values()) for row in rows)
+    write_bytes(path, csv_text(COLUMNS, cells).encode())
 
 
 def _cell(value: object) -> str:

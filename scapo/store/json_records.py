@@ -37,6 +37,11 @@ def read_json(path: Path, error: type[StoreError] = StoreError) -> Any:  # noqa:
         raise error(f"{path}: expected JSON, found {problem}") from problem
 
 
+def readable_json(value: object) -> str:
+    """Sorted JSON with a line for each value."""
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False) + "\n"
+
+
 def parse_json(text: str | bytes) -> Any:  # noqa: ANN401
     """The value of a text, whose numbers are those that JSON has.
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 
 from scapo.categories import JointSpec
 from scapo.geometry.matrices import rotation_error
-from scapo.store.json_records import StoreError, from_json, read_json
+from scapo.store.json_records import StoreError, from_json, read_json, readable_json
 from scapo.store.regular import NOT_OWN, is_odd
 from scapo.text import is_word
 
@@ -93,7 +92,7 @@ class Manifest:
                     del row[name]
         if not self.left_out:
             del data["left_out"]
-        return json.dumps(data, sort_keys=True, indent=1, allow_nan=False) + "\n"
+        return readable_json(data)
 
 
 def shards_digest(shards: tuple[Shard, ...]) -> str:

@@ -27,7 +27,7 @@ from scapo.store.files import (
     write,
     write_bytes,
 )
-from scapo.store.json_records import StoreError, from_json
+from scapo.store.json_records import StoreError, from_json, readable_json
 from scapo.training.journal import FORMAT, StepHeader, StoredJournal
 
 CONFIG = "config.json"
@@ -137,8 +137,8 @@ class RunFolder:
 
     def begin(self) -> None:
         """Write config.json."""
-        text = json.dumps(self.header(Position(), finished=False), indent=1, sort_keys=True)
-        write_bytes(self.path / CONFIG, (text + "\n").encode())
+        header = self.header(Position(), finished=False)
+        write_bytes(self.path / CONFIG, readable_json(header).encode())
 
     def found(self, *, resume: bool) -> bool:
         """Whether there is a run to continue.

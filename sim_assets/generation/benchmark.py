@@ -9,7 +9,6 @@ file, its objects in another.
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from typing import Any, Literal, get_args
 
 from scapo.categories import CATEGORIES
 from scapo.store import write_bytes
-from scapo.store.json_records import from_json, read_json
+from scapo.store.json_records import from_json, read_json, readable_json
 from scapo.text import one_line
 from sim_assets.generation.assets import Asset, UrdfAsset
 from sim_assets.generation.generate import Made, Running, generate, open_workers
@@ -274,7 +273,7 @@ def _record(path: Path, done: Done) -> None:
         key: round(sum(split[key] for split in splits), 1)
         for key in ("samples", "bytes", "seconds")
     }
-    write_bytes(path, (json.dumps(record, indent=1, sort_keys=True) + "\n").encode())
+    write_bytes(path, readable_json(record).encode())
 
 
 def _record_ids(path: Path, done: Done) -> None:
@@ -285,7 +284,7 @@ def _record_ids(path: Path, done: Done) -> None:
     traits = {instance.id: instance.trait for instance in instances if instance.trait}
     if traits:
         listed.setdefault("traits", {})[done.piece.name] = traits
-    write_bytes(path, (json.dumps(listed, indent=1, sort_keys=True) + "\n").encode())
+    write_bytes(path, readable_json(listed).encode())
 
 
 def read_record(path: Path, expected: str = FORMAT) -> dict[str, Any]:
