@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.helpers.pages import code_blocks
+
 tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 LINK = re.compile(r"\]\(([^)\s#:]+)(?:#[^)]*)?\)")
 
@@ -58,7 +60,7 @@ def test_every_page_is_in_the_navigation_once(pages: list[Path], repository: Pat
 
 def test_the_drawing_has_every_room(repository: Path):
     """Those of the import contracts, which name every file and folder of the packages."""
-    drawing = (repository / "docs" / "architecture.md").read_text().split("```")[1]
+    drawing = code_blocks((repository / "docs" / "architecture.md").read_text())[0]
     project = tomllib.loads((repository / "pyproject.toml").read_text())
     layers = [
         layer

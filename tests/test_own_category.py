@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shlex
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,6 +20,7 @@ from scapo.store import open_split, read_header
 from scapo.store.definitions import read_categories
 from scapo.store.manifest import read_manifest
 from tests.helpers.boxes import box
+from tests.helpers.pages import code_blocks
 from tests.helpers.small import FLAGS
 
 PROGRAMS = {"scapo-data": sim_assets.__main__.main, "scapo-bench": bench.__main__.main}
@@ -38,11 +38,6 @@ SMALL = {
 @pytest.fixture(scope="module")
 def page(repository: Path) -> str:
     return (repository / "docs" / "categories.md").read_text()
-
-
-def block(page: str, language: str) -> str:
-    found = re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
-    return found[0]
 
 
 def write_fridge(folder: Path, number: int) -> None:
@@ -77,9 +72,9 @@ def place(page, tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("own")
     for number in range(2):
         write_fridge(place / "MODELS" / f"f{number}", number)
-    (place / "mine.toml").write_text(block(page, "toml"))
+    (place / "mine.toml").write_text(code_blocks(page, "toml")[0])
     names = {"MODELS", "DATA", "RUN", "SCORES", "TABLES", "OUT"}
-    for line in block(page, "sh").splitlines():
+    for line in code_blocks(page, "sh")[0].splitlines():
         if not line:
             continue
         program, verb, *rest = shlex.split(line)
@@ -97,7 +92,7 @@ def place(page, tmp_path_factory) -> Path:
 
 
 def test_the_file_of_the_page_is_one(page, tmp_path):
-    (tmp_path / "mine.toml").write_text(block(page, "toml"))
+    (tmp_path / "mine.toml").write_text(code_blocks(page, "toml")[0])
     found = read_categories(tmp_path / "mine.toml")
     assert list(found) == ["fridge", "chest"]
     assert not set(found) & set(CATEGORIES)
@@ -130,7 +125,7 @@ def test_the_trained_method_answers_without_the_file(place):
 
 
 def test_another_definition_is_other_data(place, page, tmp_path, capsys):
-    (tmp_path / "mine.toml").write_text(block(page, "toml").replace("1.9", "2.5", 1))
+    (tmp_path / "mine.toml").write_text(code_blocks(page, "toml")[0].replace("1.9", "2.5", 1))
     words = ["generate", "fridge", "--categories", str(tmp_path / "mine.toml"), "--source",
              str(place / "MODELS"), "--out", str(place / "DATA")]  # fmt: skip
     assert run("scapo-data", *words, *SMALL["generate"]) == 1
@@ -138,7 +133,7 @@ def test_another_definition_is_other_data(place, page, tmp_path, capsys):
 
 
 def test_who_asks_for_it_wrongly_is_told_what_to_do(place, page, tmp_path, capsys):
-    (tmp_path / "mine.toml").write_text(block(page, "toml"))
+    (tmp_path / "mine.toml").write_text(code_blocks(page, "toml")[0])
     out = ["--out", str(tmp_path / "out")]
     assert run("scapo-data", "generate", "fridge", *out) == 2
     assert "or one of your own with --categories FILE" in capsys.readouterr().err
@@ -154,7 +149,7 @@ def test_who_asks_for_it_wrongly_is_told_what_to_do(place, page, tmp_path, capsy
 
 @pytest.mark.slow
 def test_real_fridges_are_read(page, shared_dir, tmp_path, capsys):
-    (tmp_path / "mine.toml").write_text(block(page, "toml"))
+    (tmp_path / "mine.toml").write_text(code_blocks(page, "toml")[0])
     words = ["check", str(shared_dir / "assets" / "fridge"), "--category", "fridge"]
     code = run("scapo-data", *words, "--categories", str(tmp_path / "mine.toml"), "--workers", "0")
     assert code == 0

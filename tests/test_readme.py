@@ -12,6 +12,7 @@ import pytest
 
 import bench.__main__
 import sim_assets.__main__
+from tests.helpers.pages import code_blocks
 
 PROGRAMS: dict[str, Callable[..., None]] = {
     "scapo-data": sim_assets.__main__.main,
@@ -26,8 +27,7 @@ def readme(repository: Path) -> str:
 
 def commands(text: str) -> list[list[str]]:
     """Command lines of the shell blocks, split into words."""
-    blocks = re.findall(r"```\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line for block in blocks for line in block.splitlines()]
+    lines = [line for block in code_blocks(text) for line in block.splitlines()]
     return [shlex.split(line, comments=True) for line in lines if line.startswith("scapo-")]
 
 

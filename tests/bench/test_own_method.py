@@ -14,17 +14,16 @@ import pytest
 from bench import __main__ as program
 from bench.scoring.score_files import read_scores
 from tests.helpers import made
+from tests.helpers.pages import code_blocks
 
 
 @pytest.mark.parametrize("category", ["laptop", pytest.param("eyeglasses", marks=pytest.mark.slow)])
 def test_the_example_runs(repository, tmp_path, category, monkeypatch):
     page = (repository / "docs" / "bring-your-own-method.md").read_text()
-    code = re.search(r"```python\n(.*?)```", page, re.DOTALL)
-    commands = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
-    assert code
-    assert 25 <= len(code[1].splitlines()) <= 40
-    assert "scapo" not in re.sub(r"scapo-predictions|\"scapo\"", "", code[1])
-    (tmp_path / "halves.py").write_text(code[1])
+    code, commands = code_blocks(page, "python")[0], code_blocks(page, "bash")
+    assert 25 <= len(code.splitlines()) <= 40
+    assert "scapo" not in re.sub(r"scapo-predictions|\"scapo\"", "", code)
+    (tmp_path / "halves.py").write_text(code)
     made.make_data(tmp_path / "DATA" / "clean", category)
     monkeypatch.chdir(tmp_path)
     lines = "\n".join(commands).replace("\\\n", " ").splitlines()

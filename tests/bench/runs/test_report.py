@@ -18,7 +18,7 @@ from scapo.store.checkpoint import read_checkpoint
 from scapo.store.schema import StoreError
 from scapo.training import fit
 from tests.helpers.tiny import tiny, tiny_data
-from tests.scapo.training.test_fit import CONFIG
+from tests.helpers.two_ranks import CONFIG
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from scapo.training import fit
 from scapo.training import log as progress_pictures
 from scapo.training.log import PICTURES, shown
 from tests.helpers.tiny import tiny, tiny_data
-from tests.scapo.training.test_fit import CONFIG
+from tests.helpers.two_ranks import CONFIG
 
 NAMES = {
     "canonicalise-canonical.png",

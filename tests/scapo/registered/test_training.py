@@ -27,7 +27,8 @@ from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
-from tests.scapo.training.test_fit import InterruptedRunError, same
+from tests.helpers.two_ranks import StoppedError
+from tests.scapo.training.test_fit import same
 
 DISCOVERY = DiscoveryConfig(
     seeds=12, rotations=200, searched=12, trusted=(0.9,), starts=3, draws=1, heats=(), judged=4,
@@ -78,10 +79,10 @@ def test_a_template_at_hand_is_learned_stored_and_gone_on_with(
 
     def stopping(progress: fit.Progress) -> None:
         if (progress.stage.name, progress.epoch) == ("round-2", 1):
-            raise InterruptedRunError
+            raise StoppedError
 
     fit.fit(method(config), data, tmp_path / "whole", RUN)
-    with pytest.raises(InterruptedRunError):
+    with pytest.raises(StoppedError):
         fit.fit(method(config), data, tmp_path / "cut", RUN, listener=stopping)
     fit.fit(method(config), data, tmp_path / "cut", RUN, resume=True)
     same(tmp_path / "whole", tmp_path / "cut")
@@ -122,7 +123,7 @@ def test_the_same_views_give_the_same_template_interrupted_or_not(
     """Of few views, which tell no joint: the steps are those of a discovery, and real."""
 
     def interrupted(*_: object) -> NoReturn:
-        raise InterruptedRunError
+        raise StoppedError
 
     def found(journal: Journal) -> Discovery:
         return discover(views, ("revolute",), few, generator(3), journal=journal)
@@ -136,7 +137,7 @@ def test_the_same_views_give_the_same_template_interrupted_or_not(
     one = found(Journal())
     with monkeypatch.context() as patch:
         patch.setattr(discovery, "densified", interrupted)
-        with pytest.raises(InterruptedRunError):
+        with pytest.raises(StoppedError):
             found(stored())
     for step in ("common_frame", "fitted_proposals", "advance", "_advance_alone"):
         monkeypatch.setattr(discovery, step, interrupted)  # none of them is done again

@@ -27,9 +27,7 @@ from scapo.training.run_folder import TIMING
 from scapo.types import Labels, Observation
 from tests.conftest import REPOSITORY
 from tests.helpers.tiny import TINY, tiny, tiny_data
-from tests.helpers.two_ranks import BATCH, Line
-
-CONFIG = fit.FitConfig(log_every=2, checkpoint_every=0.0, pictures_every=None)
+from tests.helpers.two_ranks import BATCH, CONFIG, Line, StoppedError, stop_after
 
 
 def run(folder: Path, *, resume: bool = False, config: fit.FitConfig = CONFIG) -> None:
@@ -63,25 +61,12 @@ def test_another_seed_gives_another_run(whole: Path, tmp_path: Path) -> None:
     assert (whole / WEIGHTS).read_bytes() != (tmp_path / WEIGHTS).read_bytes()
 
 
-class InterruptedRunError(Exception):
-    """Stands for a kill."""
-
-
 @pytest.mark.parametrize("stop", [2, 4, 7, 10])
 def test_a_run_stopped_anywhere_continues_bit_for_bit(
     whole: Path, tmp_path: Path, stop: int
 ) -> None:
-    steps = 0
-
-    def listener(progress: fit.Progress) -> None:
-        nonlocal steps
-        del progress
-        steps += 1
-        if steps == stop:
-            raise InterruptedRunError
-
-    with pytest.raises(InterruptedRunError):
-        fit.fit(tiny(), tiny_data(), tmp_path, CONFIG, listener=listener)
+    with pytest.raises(StoppedError):
+        fit.fit(tiny(), tiny_data(), tmp_path, CONFIG, listener=stop_after(stop))
     run(tmp_path, resume=True)
     same(whole, tmp_path)
 
@@ -122,7 +107,7 @@ import sys, time
 from pathlib import Path
 from scapo.training import fit
 from tests.helpers.tiny import tiny, tiny_data
-from tests.scapo.training.test_fit import CONFIG
+from tests.helpers.two_ranks import CONFIG
 folder = Path(sys.argv[1])
 steps = 0
 def listener(progress):

@@ -21,8 +21,8 @@ from scapo.training import fit
 from scapo.training.run_folder import START, kept
 from scapo.types import Labels, Observation
 from tests.helpers.tiny import tiny_data
-from tests.helpers.two_ranks import CONFIG, Line
-from tests.scapo.training.test_fit import InterruptedRunError, same
+from tests.helpers.two_ranks import CONFIG, Line, StoppedError
+from tests.scapo.training.test_fit import same
 
 STEPS = 4
 
@@ -51,7 +51,7 @@ class Slow(Line):
 
     def _made(self, before: Observation, stage: str, generator: torch.Generator) -> Observation:
         if len(self.done) == self.stop:
-            raise InterruptedRunError
+            raise StoppedError
         self.done.append(stage)
         return map_tensors(before, lambda x: x + torch.rand(x.shape, generator=generator))
 
@@ -70,7 +70,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def cut(tmp_path: Path) -> Path:
     """A run that was killed after three steps of its first start."""
-    with pytest.raises(InterruptedRunError):
+    with pytest.raises(StoppedError):
         run(Slow(3), tmp_path)
     return tmp_path
 
@@ -83,7 +83,7 @@ def files(folder: Path) -> list[Path]:
 def test_an_interrupted_start_goes_on_bit_for_bit(
     whole: Path, tmp_path: Path, stop: int, left: int
 ) -> None:
-    with pytest.raises(InterruptedRunError):
+    with pytest.raises(StoppedError):
         run(Slow(stop), tmp_path)
     assert len(files(tmp_path)) == stop % STEPS
     method = Slow(8)
@@ -215,7 +215,7 @@ class Wide(Line):
             made = self.journal.once(f"seed {seed}", make, generator, {"Observation": Observation})
             total = total + made.points * (1 + seed)
             if seed == self.stop:
-                raise InterruptedRunError
+                raise StoppedError
         self.drawn = total.mean(-1)[0]
 
     def __init__(self, folder: Path, stop: int = STEPS) -> None:
@@ -230,7 +230,7 @@ def test_steps_side_by_side_are_kept_as_those_one_by_one(tmp_path: Path) -> None
     here, there = Wide(tmp_path / "a"), Wide(tmp_path / "b", stop=1)
     fit.fit(here, tiny_data(), tmp_path / "here", CONFIG)
     several = replace(CONFIG, workers=2)
-    with pytest.raises(InterruptedRunError):
+    with pytest.raises(StoppedError):
         fit.fit(there, tiny_data(), tmp_path / "there", several)
     assert len(list((tmp_path / "there" / START).iterdir())) == 2
     again = Wide(tmp_path / "c")

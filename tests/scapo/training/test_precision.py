@@ -35,7 +35,7 @@ from scapo.training.precision import (
 from scapo.types import Labels, Observation
 from tests.conftest import REPOSITORY
 from tests.helpers.tiny import tiny, tiny_data
-from tests.helpers.two_ranks import CONFIG, Line
+from tests.helpers.two_ranks import CONFIG, Line, StoppedError, stop_after
 
 HALF: tuple[Precision, ...] = ("bfloat16", "float16")
 CLOUDS, _ = normalise(tiny_data().observation.points)
@@ -107,24 +107,11 @@ def test_overflowing_steps_are_left_out_until_the_scale_fits(tmp_path: Path) -> 
     assert not (tmp_path / "bad-batch.safetensors").exists()
 
 
-class StoppedError(Exception):
-    """Stands for a kill."""
-
-
 def test_a_run_in_float16_continues_bit_for_bit(tmp_path: Path) -> None:
     config = replace(CONFIG, arithmetic=Arithmetic(precision="float16"))
     fit.fit(Steep(), tiny_data(), tmp_path / "whole", config)
-    steps = 0
-
-    def stop(progress: fit.Progress) -> None:
-        nonlocal steps
-        del progress
-        steps += 1
-        if steps == 5:
-            raise StoppedError
-
     with pytest.raises(StoppedError):
-        fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, listener=stop)
+        fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, listener=stop_after(5))
     fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, resume=True)
     for name in (WEIGHTS, "metrics.jsonl"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-import re
 import sys
 import tarfile
 from pathlib import Path
@@ -17,6 +16,7 @@ from safetensors import safe_open
 
 from sim_assets.formats.export import ExportFormat, export
 from tests.helpers.made import sample_arrays, write_split
+from tests.helpers.pages import code_blocks
 from tests.helpers.programs import run
 
 FORMATS = get_args(ExportFormat)
@@ -123,7 +123,7 @@ def test_the_readme_that_comes_with_it_works(data: Path, tmp_path: Path, form: s
     folder = data / "sensor"
     export(folder, [folder / "laptop/train"], tmp_path / "out", form)  # type: ignore[arg-type]
     text = (tmp_path / "out/README.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+    (block,) = code_blocks(text, "python")
     monkeypatch.chdir(tmp_path / "out")
     names: dict[str, Any] = {}
     exec(compile(block, "README.md", "exec"), names)

@@ -31,8 +31,7 @@ from scapo.types import Labels, Observation
 from tests.helpers import made
 from tests.helpers.small import FLAGS
 from tests.helpers.tiny import tiny, tiny_data
-from tests.helpers.two_ranks import Line
-from tests.scapo.training.test_fit import CONFIG
+from tests.helpers.two_ranks import CONFIG, Line
 
 
 @contextmanager

@@ -15,6 +15,7 @@ import pytest
 from sim_assets.importers import hoi4d, shape2motion
 from sim_assets.importers.models import Hinge, Model, told_limits
 from sim_assets.importers.records import read_obj
+from sim_assets.importers.sets import ModelReader
 from tests.helpers import boxes, foreign
 
 
@@ -144,16 +145,21 @@ def change_node(folder: Path, **values: object) -> None:
     motion(folder, lambda tree: tree["children"][0].update(values))
 
 
+def refused(reader: ModelReader, folder: Path, message: str) -> None:
+    """In one line that begins with the model's folder."""
+    (found,) = reader.find(folder)
+    with pytest.raises(ValueError, match=message) as caught:
+        reader.read(found)
+    assert str(caught.value).startswith(f"{folder}/")
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("name", S2M)
 def test_damaged_shape2motion(name: str, tmp_path: Path):
     damage, message = S2M[name]
     folder = foreign.shape2motion(boxes.laptop(), tmp_path, "laptop")
     damage(folder)
-    (found,) = shape2motion.find(tmp_path)
-    with pytest.raises(ValueError, match=message) as caught:
-        shape2motion.read(found)
-    assert str(caught.value).startswith(f"{folder}/")
-    assert "\n" not in str(caught.value)
+    refused(shape2motion, folder, message)
 
 
 def change_json(folder: Path, file: str, change: Callable[[Any], object]) -> None:
@@ -207,11 +213,7 @@ def test_damaged_hoi4d(name: str, tmp_path: Path):
     damage, message = HOI4D[name]
     folder = foreign.hoi4d(boxes.laptop(), tmp_path, "laptop")
     damage(folder)
-    (found,) = hoi4d.find(tmp_path)
-    with pytest.raises(ValueError, match=message) as caught:
-        hoi4d.read(found)
-    assert str(caught.value).startswith(f"{folder}/")
-    assert "\n" not in str(caught.value)
+    refused(hoi4d, folder, message)
 
 
 LIMITS = {
