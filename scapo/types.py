@@ -68,6 +68,38 @@ class Labels:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FullyLabelled:
+    """Clouds with all of their labels, camera frame."""
+
+    points: Float[Tensor, "*B N 3"]
+    part: Int[Tensor, "*B N"]
+    camera_T_part: Float[Tensor, "*B P 4 4"]
+    joints: Joints
+    instance: Int[Tensor, "*B"]
+
+    @classmethod
+    def of(cls, observation: Observation, labels: Labels, who: str) -> FullyLabelled:
+        """Of a method or tool `who` that needs all.
+
+        Raises:
+            ValueError: Some are withheld.
+        """
+        part, pose = labels.part, labels.camera_T_part
+        joints, instance = labels.joints, labels.instance
+        if part is None or pose is None or joints is None or instance is None:
+            raise ValueError(
+                f"{who}: expected parts, poses, joints and objects, found some withheld"
+            )
+        return cls(
+            points=observation.points,
+            part=part,
+            camera_T_part=pose,
+            joints=joints,
+            instance=instance,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SampleKey:
     """Which sample this is: unique within a data set."""
 

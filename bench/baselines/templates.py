@@ -20,7 +20,7 @@ from torch import Tensor
 from scapo.geometry.points import farthest_points, k_means, normalise
 from scapo.geometry.rigid import apply, invert
 from scapo.records import cat, take
-from scapo.types import Labels, Observation
+from scapo.types import FullyLabelled, Labels, Observation
 
 LEAST_POINTS = 11
 """Points of a part that can be registered, or registered to: small_gicp warns of fewer."""
@@ -69,17 +69,6 @@ class FusionConfig:
     """Points of each part of a template, by farthest-point sampling."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Seen:
-    """Clouds with all of their labels."""
-
-    points: Float[Tensor, "B N 3"]
-    part: Int[Tensor, "B N"]
-    camera_T_part: Float[Tensor, "B P 4 4"]
-    pivot: Float[Tensor, "B J 3"]
-    axis: Float[Tensor, "B J 3"]
-
-
 @torch.no_grad()
 def fuse(
     observation: Observation, labels: Labels, config: FusionConfig, generator: torch.Generator
@@ -95,19 +84,8 @@ def fuse(
     Raises:
         ValueError: Labels are withheld, or fewer objects than templates show every part.
     """
-    part, pose, joints, instance = labels.part, labels.camera_T_part, labels.joints, labels.instance
-    if part is None or pose is None or joints is None or instance is None:
-        raise ValueError(
-            "templates: expected parts, poses, joints and objects, found some withheld"
-        )
-    seen = _Seen(
-        points=observation.points,
-        part=part,
-        camera_T_part=pose,
-        pivot=joints.pivot,
-        axis=joints.axis,
-    )
-    whole = _shown_whole(part, instance, pose.shape[1])
+    seen = FullyLabelled.of(observation, labels, "templates")
+    whole = _shown_whole(seen.part, seen.instance, seen.camera_T_part.shape[1])
     if len(whole) < config.templates:
         raise ValueError(
             f"templates: expected at least {config.templates} training objects whose clouds show "
@@ -115,7 +93,7 @@ def fuse(
         )
     order = torch.randperm(len(whole), generator=generator, device=generator.device)
     chosen = whole[order[: config.templates].to(whole.device)]
-    return cat([_fused(take(seen, instance == number), config) for number in chosen])
+    return cat([_fused(take(seen, seen.instance == number), config) for number in chosen])
 
 
 def _shown_whole(
@@ -128,7 +106,7 @@ def _shown_whole(
     return known[(total >= LEAST_POINTS).all(1)]
 
 
-def _fused(seen: _Seen, config: FusionConfig) -> Templates:
+def _fused(seen: FullyLabelled, config: FusionConfig) -> Templates:
     """The template of the one object that all these clouds show."""
     scale = normalise(seen.points)[1].scale.median()
     part_T_camera = invert(seen.camera_T_part)
@@ -145,8 +123,8 @@ def _fused(seen: _Seen, config: FusionConfig) -> Templates:
     return Templates(
         points=torch.stack(clouds)[None],
         base_T_part=base_T_part[state][None],
-        pivot=(apply(base_T_camera, seen.pivot) * scale)[:1],
-        axis=(seen.axis @ base_T_camera[:, :3, :3].mT)[:1],
+        pivot=(apply(base_T_camera, seen.joints.pivot) * scale)[:1],
+        axis=(seen.joints.axis @ base_T_camera[:, :3, :3].mT)[:1],
     )
 
 

@@ -28,7 +28,7 @@ from scapo.geometry.points import Similarity, ends, nearest
 from scapo.geometry.rigid import apply, invert
 from scapo.method import changes
 from scapo.ranges import Share
-from scapo.records import take
+from scapo.records import map_tensors, take
 from scapo.registered.base import AbstractRegistered
 from scapo.registered.config import UNNAMED, SearchConfig
 from scapo.registered.discovery import Discovery
@@ -43,7 +43,7 @@ from scapo.registered.template import (
 )
 from scapo.registered.view_loss import view_loss
 from scapo.registered.views import PartialViews
-from scapo.types import Labels, Observation, Supervision
+from scapo.types import FullyLabelled, Labels, Observation, Supervision
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,8 @@ class LabelledRegistered(AbstractRegistered):
             ValueError: Some are withheld.
         """
         del generator
-        clouds = _labelled(observation, labels)
+        clouds = FullyLabelled.of(observation, labels, self.name)
+        clouds = map_tensors(clouds, lambda tensor: tensor.cpu())
         made = labelled_template(learned, clouds, self.template.kinds, len(self.template.points))
         logger.info("template of true placements: mean loss %.3f", float(made.found.loss.mean()))
         return made
@@ -109,39 +110,9 @@ class LabelledRegistered(AbstractRegistered):
         return torch.zeros_like(self.template.points[0])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Clouds:
-    """All training clouds with all of their labels, on the host."""
-
-    points: Float[Tensor, "B N 3"]
-    part: Int[Tensor, "B N"]
-    camera_T_part: Float[Tensor, "B P 4 4"]
-    pivot: Float[Tensor, "B J 3"]
-    axis: Float[Tensor, "B J 3"]
-    state: Float[Tensor, "B J"]
-    instance: Int[Tensor, " B"]
-
-
-def _labelled(observation: Observation, labels: Labels) -> _Clouds:
-    part, pose, joints, instance = labels.part, labels.camera_T_part, labels.joints, labels.instance
-    if part is None or pose is None or joints is None or instance is None:
-        raise ValueError(
-            "registered-labelled: expected parts, poses, joints and objects, found some withheld"
-        )
-    return _Clouds(
-        points=observation.points.cpu(),
-        part=part.cpu(),
-        camera_T_part=pose.cpu(),
-        pivot=joints.pivot.cpu(),
-        axis=joints.axis.cpu(),
-        state=joints.state.cpu(),
-        instance=instance.cpu(),
-    )
-
-
 @torch.no_grad()
 def labelled_template(
-    learned: LearnedClouds, clouds: _Clouds, kinds: tuple[JointKind, ...], count: int
+    learned: LearnedClouds, clouds: FullyLabelled, kinds: tuple[JointKind, ...], count: int
 ) -> Discovery:
     """The template of true placements, and those of the learned clouds.
 
@@ -157,9 +128,9 @@ def labelled_template(
     placement = true_placements(own, extent, learned.similarity, template.sliding[:, 0])
     back = invert(own.camera_T_part[:, 0])
     larger = placement.log_scale.exp()[:, None]
-    axis = F.normalize((own.axis @ back[:, :3, :3].mT).mean(0), dim=-1)
+    axis = F.normalize((own.joints.axis @ back[:, :3, :3].mT).mean(0), dim=-1)
     template.axis.copy_(axis)
-    pivot = apply(back, own.pivot) * scale[:, None, None] / larger
+    pivot = apply(back, own.joints.pivot) * scale[:, None, None] / larger
     template.pivot.copy_(pivot.median(0).values)
     placement = replace(
         placement, shift=_shifts(centre * scale[:, None, None], placement, template)
@@ -170,7 +141,7 @@ def labelled_template(
     return Discovery(template=template, found=found)
 
 
-def rest_boxes(clouds: _Clouds) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B P 3"]]:
+def rest_boxes(clouds: FullyLabelled) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B P 3"]]:
     """Extent of each cloud's object at rest, and the middle of each of its parts (`ends`), m.
 
     From all clouds of the object together, in its frame at rest. A part that none shows is in the
@@ -194,7 +165,7 @@ def rest_boxes(clouds: _Clouds) -> tuple[Float[Tensor, "B 3"], Float[Tensor, "B 
 
 
 def true_placements(
-    clouds: _Clouds,
+    clouds: FullyLabelled,
     extent: Float[Tensor, "B 3"],
     similarity: Similarity,
     sliding: Float[Tensor, " J"],
@@ -213,7 +184,7 @@ def true_placements(
     placement = Placement.at(
         pose[:, :3, :3],
         similarity.forward(pose[:, None, :3, 3])[:, 0],
-        torch.where(sliding > 0, clouds.state * scale, clouds.state),
+        torch.where(sliding > 0, clouds.joints.state * scale, clouds.joints.state),
     )
     return replace(placement, log_scale=size - size.mean(0))
 
@@ -230,7 +201,7 @@ def _shifts(
 
 
 def _shared_surface(
-    clouds: _Clouds, learned: LearnedClouds, placement: Placement, count: int
+    clouds: FullyLabelled, learned: LearnedClouds, placement: Placement, count: int
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"], Float[Tensor, "M P"]]:
     """Points, normals and part logits of the surface that most clouds share, spread out."""
     points, normals, part = _at_rest(clouds, learned, placement)
@@ -255,7 +226,7 @@ def _same(feature: Float[Tensor, "C D"], others: Float[Tensor, "O D"]) -> Float[
 
 
 def _at_rest(
-    clouds: _Clouds, learned: LearnedClouds, placement: Placement
+    clouds: FullyLabelled, learned: LearnedClouds, placement: Placement
 ) -> tuple[Float[Tensor, "C 3"], Float[Tensor, "C 3"], Int[Tensor, " C"]]:
     """Points, normals and parts of the views, all in the template's frame, size and state."""
     views = learned.views
