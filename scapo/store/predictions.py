@@ -30,18 +30,19 @@ from scapo.store.schema import StoreError
 from scapo.store.split import Split, open_split
 from scapo.types import Supervision
 
-RECORD = (
-    "R_select",
-    "T_select",
-    "S_joint",
-    "S_drct",
-    "S_angl",
-    "I_joint",
-    "I_drct",
-    "I_angl",
-)
+RECORD: dict[str, tuple[int | None, ...]] = {
+    "R_select": (3, 3),
+    "T_select": (3,),
+    "S_joint": (None, 3),
+    "S_drct": (None, 3),
+    "S_angl": (None, 2),
+    "I_joint": (None, 3),
+    "I_drct": (None, 3),
+    "I_angl": (None, 2),
+}
 """The network-side quantities of OP-Align: rotation and translation chosen for the input, and
-pivots, directions and pairs of states on the aligned input (S) and the canonical shape (I)."""
+pivots, directions and pairs of states on the aligned input (S) and the canonical shape (I).
+Shape of a sample: None for the number of joints."""
 LONGEST_NAME = 200
 """Characters of a name in the header."""
 DIGEST_KEYS = ("data_digest", "digest", "data")
@@ -261,7 +262,6 @@ class Predictions:
             )
 
 
-_FLOAT = ("F32",)
 _HALF_OR_FLOAT = ("F16", "F32")
 _NUMBER = ("F16", "F32", "F64")
 
@@ -282,17 +282,17 @@ def check_tensors(where: str, file: Any, split: Split) -> dict[str, Any]:  # noq
     Raises:
         StoreError: A tensor is missing, unknown, of another type or shape.
     """
-    count, n = split.manifest.count, split.manifest.points
-    p, j = len(split.manifest.parts), len(split.manifest.joints)
+    manifest, count = split.manifest, split.manifest.count
+    shapes, joints = split.shapes(count), len(manifest.joints)
     layout: dict[str, tuple[tuple[str, ...], tuple[int | None, ...]]] = {
-        "part": (("U8",), (count, n)),
-        "part_weight": (_HALF_OR_FLOAT, (count, n, p)),
-        "camera_T_part": (_FLOAT, (count, p, 4, 4)),
-        "joint_pivot": (_FLOAT, (count, j, 3)),
-        "joint_axis": (_FLOAT, (count, j, 3)),
-        "joint_state": (_FLOAT, (count, j)),
-        "canonical_points": (_FLOAT, (count, None, 3)),
-        **{f"record_{name}": (_NUMBER, (count, *_record_shape(name, j))) for name in RECORD},
+        "part": (("U8",), shapes["part"]),
+        "part_weight": (_HALF_OR_FLOAT, (*shapes["part"], len(manifest.parts))),
+        **{name: (("F32",), shapes[name]) for name in SLOTTED},
+        "canonical_points": (("F32",), (count, None, 3)),
+        **{
+            f"record_{name}": (_NUMBER, (count, *(joints if d is None else d for d in dims)))
+            for name, dims in RECORD.items()
+        },
         "record_expand": (_NUMBER, (count,)),
         "record_center": (_NUMBER, (count, 3)),
     }
@@ -314,14 +314,6 @@ def check_tensors(where: str, file: Any, split: Split) -> dict[str, Any]:  # noq
             f"{where}: expected one of the tensors 'part' and 'part_weight', found {found}"
         )
     return slices
-
-
-def _record_shape(name: str, joints: int) -> tuple[int, ...]:
-    if name == "R_select":
-        return (3, 3)
-    if name == "T_select":
-        return (3,)
-    return (joints, 2) if name.endswith("angl") else (joints, 3)
 
 
 def _check_tensor(
