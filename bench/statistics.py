@@ -40,7 +40,6 @@ def interval(
     instance: Int[np.ndarray, " B"],
     *,
     resamples: int = RESAMPLES,
-    seed: int = BOOTSTRAP_SEED,
 ) -> Interval:
     """Mean over all defined values of (B, K) or (B,), resampled by instance.
 
@@ -48,14 +47,13 @@ def interval(
         values: NaN where undefined.
         instance: Which object each of the B samples shows.
         resamples: Bootstrap draws.
-        seed: Of the draws.
     """
     table = np.asarray(values, np.float64).reshape(len(values), -1)
     known = table[~np.isnan(table)]
     if known.size == 0:
         nan = float("nan")
         return Interval(mean=nan, low=nan, high=nan, count=0, undefined=int(table.size))
-    low, high = bounds(resampled_means(table, instance, resamples=resamples, seed=seed))
+    low, high = bounds(resampled_means(table, instance, resamples=resamples))
     return Interval(
         mean=float(known.mean()),
         low=low,

@@ -91,9 +91,6 @@ class AbstractRegistration(OracleMethod):
     """No parameters, only the templates that `start` keeps; how first poses are found is open."""
 
     template_points: Tensor
-    template_base_T_part: Tensor
-    template_pivot: Tensor
-    template_axis: Tensor
 
     def __init__(
         self, config: RegistrationConfig, category: Category, generator: torch.Generator

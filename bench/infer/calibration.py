@@ -26,9 +26,9 @@ from scapo.store.json_records import from_json, read_json
 from scapo.store.schema import StoreError
 
 FORMAT, OF_BEFORE = "scapo-calibration/2", "scapo-calibration/1"
-FEATURES = ("residual", "margin", "spread")
 SIGNS = (-1.0, 1.0, -1.0)
-"""Of the weights: a larger residual or spread cannot speak for an answer."""
+"""Of the weights of residual, margin and spread: a larger residual or spread cannot speak for an
+answer."""
 LEAST_RESIDUAL = 1e-3
 RIDGE = 1e-2
 """Weight of the squared weights, so that a method that is never wrong has finite ones."""

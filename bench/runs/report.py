@@ -201,11 +201,11 @@ def _folded(config: Mapping[str, Any]) -> str:
 def table(head: list[str], rows: Iterable[Iterable[object]]) -> str:
     """An HTML table; numbers to the right."""
 
-    def cell(tag: str, value: object) -> str:
+    def cell(value: object) -> str:
         text = f"{value:,}" if isinstance(value, int) else str(value)
         number = bool(head) and text.replace(",", "").replace(".", "").lstrip("-").isdigit()
-        return f"<{tag}{' class=n' if number else ''}>{escape(text)}</{tag}>"
+        return f"<td{' class=n' if number else ''}>{escape(text)}</td>"
 
     lines = [f"<tr>{''.join(f'<th>{escape(name)}</th>' for name in head)}</tr>"] if head else []
-    lines += [f"<tr>{''.join(cell('td', value) for value in row)}</tr>" for row in rows]
+    lines += [f"<tr>{''.join(cell(value) for value in row)}</tr>" for row in rows]
     return f"<table>{''.join(lines)}</table>"

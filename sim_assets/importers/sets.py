@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from scapo.export.urdf import write_urdf
 from scapo.parallel.pool import AbstractPool, Pool, Report
@@ -26,7 +26,6 @@ from sim_assets.importers.models import Folder, Model
 from sim_assets.importers.splits import CloudReader, SplitWriter, import_split
 from sim_assets.models.limits import CLOCK_SECONDS, bounded
 
-SetName = Literal["op-align-real", "op-align-light", "shape2motion", "hoi4d", "partnet-mobility"]
 Progress = Callable[[str, int, int], None]
 
 
@@ -94,7 +93,7 @@ def import_set(
     """Bring a set into our layout.
 
     Args:
-        name: One of `SetName`.
+        name: Of the set, as on the command line.
         path: The set's folder, or one above or within it.
         out: Clouds: `out/<category>/<split>`, with the set's own names of variant and category
             above where one category and split has several. Models: `out/<category>/<id>`.

@@ -44,17 +44,14 @@ PUBLISHED = Disparity()
 REDWOOD = Disparity(scale=35.130 * 8, sigma=8 / 36, shift=1 / 4)
 
 
-def depth_step(z: Float[np.ndarray, "*S"], model: Disparity = PUBLISHED) -> Float[np.ndarray, "*S"]:
-    """Distance in depth between neighbouring disparities, m."""
-    return z * z / model.scale
+def depth_step(z: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
+    """Distance in depth between neighbouring disparities as published, m."""
+    return z * z / PUBLISHED.scale
 
 
-def depth_sigma(
-    z: Float[np.ndarray, "*S"], model: Disparity = PUBLISHED
-) -> Float[np.ndarray, "*S"]:
+def depth_sigma(z: Float[np.ndarray, "*S"]) -> Float[np.ndarray, "*S"]:
     """Standard deviation of z head-on, averaged over z, m: disturbance and rounding together."""
-    steps = np.sqrt(model.sigma**2 + (1 / 12 if model.rounded else 0))
-    return depth_step(z, model) * steps
+    return depth_step(z) * np.sqrt(PUBLISHED.sigma**2 + 1 / 12)
 
 
 def disparity(
