@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -23,6 +23,8 @@ from sim_assets.cli.console import progress_bar, say, say_each, show_made
 from sim_assets.options import DataOptions
 
 if TYPE_CHECKING:
+    from sim_assets.generation.generate import Progress, Running
+
     CategoryName = str
 else:
     CategoryName = Literal[tuple(CATEGORIES)]
@@ -148,6 +150,28 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Workers:
+    """The flags of who makes data, which change no byte of them."""
+
+    workers: CountOrNone | None = None
+    """Worker processes; by default as many as pay, one per core at most, and one at least for
+    models of a folder. 0: work in this process, unprotected against objects that crash or hang."""
+    engine: Literal["local", "ray"] = "local"
+    """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
+    (docs/cluster.md)."""
+    timeout: Positive = 300.0
+    """Seconds without a sign of life after which an object counts as hanging and is left out."""
+    strict: bool = False
+    """Stop at the first object that fails."""
+
+    def running(self, show: Progress) -> Running:
+        """The same with who is told of progress."""
+        from sim_assets.generation.generate import Running
+
+        return Running(**asdict(self), progress=show)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Generate:
     """Make labelled point clouds: OUT/CATEGORY/SPLIT/manifest.json and shards.
 
@@ -162,31 +186,16 @@ class Generate:
     """Categories of your own, a TOML file (docs/categories.md); it takes --source with models. The
     data carry the definition, so that no later command asks for the file."""
     data: Annotated[DataOptions, tyro.conf.arg(name="")] = field(default_factory=DataOptions)
-    workers: CountOrNone | None = None
-    """Worker processes; by default as many as pay, one per core at most, and one at least for
-    models of a folder. 0: work in this process, unprotected against objects that crash or hang."""
-    engine: Literal["local", "ray"] = "local"
-    """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
-    (docs/cluster.md)."""
-    timeout: Positive = 300.0
-    """Seconds without a sign of life after which an object counts as hanging and is left out."""
-    strict: bool = False
-    """Stop at the first object that fails."""
+    how: Annotated[Workers, tyro.conf.arg(name="")] = field(default_factory=Workers)
 
     def run(self, console: Console) -> int:
         """Make them, print a summary, and name the objects that failed."""
-        from sim_assets.generation.generate import Running, make_split
+        from sim_assets.generation.generate import make_split
         from sim_assets.models.library import undivided
 
         started, kind = time.monotonic(), find(self.category, self.categories)
         with progress_bar(console) as show:
-            running = Running(
-                workers=self.workers,
-                engine=self.engine,
-                timeout=self.timeout,
-                strict=self.strict,
-                progress=show,
-            )
+            running = self.how.running(show)
             made = make_split(kind, self.data, self.out, running)
         show_made(console, made, time.monotonic() - started)
         own = self.data.source != "procedural"
@@ -216,15 +225,7 @@ class Benchmark:
     Their category is told by PATH/index.csv, by themselves, or by the folder."""
     backend: Literal["auto", "sapien", "raycast"] = "sapien"
     """Renderer; the published digests are SAPIEN's."""
-    workers: CountOrNone | None = None
-    """Worker processes; by default as many as pay, one per core at most."""
-    engine: Literal["local", "ray"] = "local"
-    """Where the workers run: on this machine, or on the Ray cluster of RAY_ADDRESS
-    (docs/cluster.md)."""
-    timeout: Positive = 300.0
-    """Seconds without a sign of life after which an object counts as hanging and is left out."""
-    strict: bool = False
-    """Stop at the first object that fails."""
+    how: Annotated[Workers, tyro.conf.arg(name="")] = field(default_factory=Workers)
 
     def run(self, console: Console) -> int:
         """Make them, print a summary of each split, and name the objects that failed."""
@@ -236,7 +237,6 @@ class Benchmark:
             make_benchmark,
             pieces,
         )
-        from sim_assets.generation.generate import Running
 
         check_name(self.name)
         task = Task(only=self.only, backend=self.backend, real=self.real)
@@ -245,13 +245,7 @@ class Benchmark:
         others = {} if real is None else real.others
         say_each(console, others, label="no category", style="yellow")
         with progress_bar(console) as show:
-            running = Running(
-                workers=self.workers,
-                engine=self.engine,
-                timeout=self.timeout,
-                strict=self.strict,
-                progress=show,
-            )
+            running = self.how.running(show)
             made = make_benchmark(self.out, task, running)
             for number, done in enumerate(made, 1):
                 say(console, f"{number}/{total} {done.piece.name}")

@@ -22,7 +22,7 @@ from scapo.categories import CATEGORIES
 from scapo.store import open_split, write_bytes
 from scapo.store.manifest import MAX_POINTS
 from sim_assets.cli import verbs
-from sim_assets.cli.verbs import MOST_POINTS, VERBS, Benchmark
+from sim_assets.cli.verbs import MOST_POINTS, VERBS, Benchmark, Workers
 from sim_assets.generation import benchmark
 from sim_assets.generation.benchmark import pieces
 from sim_assets.importers import op_align_light
@@ -244,6 +244,7 @@ def test_hostile_names_in_info_and_preview(data, tmp_path, capsys):
 
 
 ONLY = ("sensor/scissors/val", "clean/laptop/val")
+HERE = Workers(workers=0)
 
 
 @pytest.fixture
@@ -260,7 +261,7 @@ def test_pieces_are_counted_and_the_record_named(
     console: Console, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(benchmark, "SIZES", dict.fromkeys(benchmark.SIZES, (1, 2)))
-    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", workers=0)
+    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", how=HERE)
     assert verb.run(console) == 0
     text = printed(console)
     names = [piece.name for piece in pieces(ONLY)]
@@ -281,7 +282,7 @@ def test_a_failed_object_ends_in_1_after_all_pieces(
             yield replace(done, made=replace(done.made, failed={"scissors-val-2-00000": "died"}))
 
     monkeypatch.setattr(benchmark, "make_benchmark", failing)
-    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", workers=0)
+    verb = Benchmark(name="sim-art/2", out=tmp_path, only=ONLY, backend="raycast", how=HERE)
     assert verb.run(console) == 1
     assert "2/2" in printed(console)
     assert "scissors-val-2-00000" in printed(console)
