@@ -316,7 +316,7 @@ class GridRequest:
     engine: Literal["local", "ray"] = "local"
     """Where trainings run: on this machine, or on the Ray cluster of RAY_ADDRESS, whose machines
     all see OUT under the same name."""
-    workers: int | None = None
+    workers: CountOrNone | None = None
     """Trainings at a time; by default one per core, or one where there is a GPU."""
     gpus: float = 0.0
     """GPUs of each training: what Ray is asked for. From 2 on a training runs as so many processes

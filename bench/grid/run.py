@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import fcntl
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -78,14 +77,11 @@ class Grid:
         """Say what is wrong with the request before anything begins.
 
         Raises:
-            ValueError: More GPUs than one that are no whole number, or a budget of nothing.
+            ValueError: More GPUs than one that are no whole number.
         """
         if request.gpus < 0 or (request.gpus > 1 and request.gpus != int(request.gpus)):
             raise ValueError(f"--gpus: expected a share of one or a whole number, found "
                              f"{request.gpus}")  # fmt: skip
-        if request.budget_minutes is not None and not 0 < request.budget_minutes < math.inf:
-            raise ValueError(f"--budget-minutes: expected more than 0, found "
-                             f"{request.budget_minutes}")  # fmt: skip
         self.request, self.presets = request, presets
         self.data = request.data or request.out / "data"
         self.machines = Machines(engine=request.engine, workers=request.workers, gpus=request.gpus)

@@ -131,8 +131,8 @@ def test_the_table_of_what_goes_on(folder: Path):
     ("flag", "message"),
     [
         (["--gpus", "1.5"], "--gpus: expected a share of one or a whole number, found 1.5"),
-        (["--budget-minutes", "0"], "--budget-minutes: expected more than 0, found 0.0"),
-        (["--budget-minutes", "nan"], "--budget-minutes: expected more than 0, found nan"),
+        (["--budget-minutes", "0"], "--budget-minutes: expected a finite number above 0"),
+        (["--budget-minutes", "nan"], "--budget-minutes: expected a finite number above 0"),
         (["--splits", "vall", "--plan-only"], "--splits: expected some of val, test, test-ood"),
         (["--splits", "train", "--plan-only"], "--splits: expected some of val, test, test-ood"),
         (["--only", "nothing", "--plan-only"], "only: expected parts (clean)"),

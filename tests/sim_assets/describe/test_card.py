@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -75,16 +76,16 @@ def parsed(command: str) -> tuple[str, DataOptions]:
     assert words[:2] == ["scapo-data", "generate"]
     given: dict[str, object] = {}
     rest = iter(words[3:])
-    types = {field.name: str(field.type) for field in fields(DataOptions)}
+    types = {name: (hint, *get_args(hint)) for name, hint in get_type_hints(DataOptions).items()}
     for word in rest:
         name = word.removeprefix("--").replace("-", "_")
         if name == "out":
             next(rest)
-        elif types[name] == "bool":
+        elif bool in types[name]:
             given[name] = True
         else:
             text = next(rest)
-            kind = float if "float" in types[name] else int if "int" in types[name] else str
+            kind = float if float in types[name] else int if int in types[name] else str
             given[name] = kind(text)
     return words[2], DataOptions(**given)  # type: ignore[arg-type]
 
