@@ -27,10 +27,21 @@ def _commands() -> Any:  # noqa: ANN401 - a union made at run time
     return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
 
 
+def _joined(words: Sequence[str]) -> list[str]:
+    """`--front -x` as `--front=-x`, since a word that begins with a dash is read as a flag."""
+    found: list[str] = []
+    for word in words:
+        if found and found[-1] in ("--up", "--front") and word in ("-x", "-y", "-z"):
+            found[-1] += f"={word}"
+        else:
+            found.append(word)
+    return found
+
+
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and end by `SystemExit`."""
     console, errors = Console(), Console(stderr=True)
-    words = sys.argv[1:] if arguments is None else list(arguments)
+    words = _joined(sys.argv[1:] if arguments is None else arguments)
     if words == ["--version"]:
         say(console, f"scapo-data {version('scapo')}")
         sys.exit(0)

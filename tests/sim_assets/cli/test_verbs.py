@@ -224,6 +224,9 @@ def test_check_says_of_each_model_what_came_of_it(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "1 accepted, 0 repaired, 1 refused" in text
     assert json.loads(results.read_text())["counts"]["refused"] == 1
+    for front in (["--front", "-y"], ["--front=-y"]):  # a word with a dash is no flag there
+        assert run("check", tmp_path / "oven", "--up", "z", *front, "--workers", 1) == 1
+        assert "1 accepted" in capsys.readouterr().out
 
 
 def test_hostile_names_in_info_and_preview(data, tmp_path, capsys):
