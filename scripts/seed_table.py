@@ -115,7 +115,8 @@ def markdown(rows: pd.DataFrame) -> str:
                   f"| category | seed | {' | '.join(METRICS)} | clouds/s | min | GB | commit |",
                   "|---" * 7 + "|---:|---:|---:|---|"]  # fmt: skip
         lines += [_line(one) for _, one in of_mode.groupby(KEYS)]
-    lines += ["", "## Apart", "", "Largest less least over the seeds.", "", *_spread(rows)]
+    if rows.groupby(KEYS[:3]).seed.nunique().max() > 1:
+        lines += ["", "## Apart", "", "Largest less least over the seeds.", "", *_spread(rows)]
     return "\n".join(lines) + "\n"
 
 
