@@ -122,14 +122,15 @@ def cut_by_mirror(template: ArticulatedTemplate, placement: Placement) -> Placem
     its hinge.
 
     Args:
-        template: Of two like halves (`alike`); others stay as they are.
+        template: Of two like halves, as it was cut (`alike`) or as it came; others stay as they
+            are.
         placement: Of the views that it was fitted to.
 
     Returns:
         The same motions as turns about the new hinge, which is where on the plane they leave the
         least shift, with the shifts that are left.
     """
-    if not bool(template.alike):
+    if not (bool(template.alike) or are_halves(template)):
         return placement
     seen, part = _seen_along(template), template.logit.argmax(-1)
     best, found = CLEARER * unlikeness(template), None

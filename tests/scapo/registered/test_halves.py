@@ -213,8 +213,9 @@ def shells(count: int, *, open_by: float, reach: float = 0.0) -> tuple[Articulat
 
 def test_shells_are_cut_where_they_mirror_each_other_and_motions_stay():
     angle = torch.linspace(-0.9, 0.6, 8)[:, None]
-    for reach, swapped in ((0.07, False), (0.07, True), (0.0, False)):
+    for reach, swapped, told in ((0.07, False, True), (0.07, True, False), (0.0, False, True)):
         made, half = shells(1600, open_by=-1.0, reach=reach)
+        made.alike.fill_(float(told))  # as a template is that came so without being cut in two
         if swapped:
             made.logit.data = made.logit.data.flip(-1)
         truth = (half != swapped).long()
@@ -246,8 +247,9 @@ def test_what_crosses_its_hinge_or_is_no_two_halves_is_not_cut():
     made.axis.copy_(UP[None])
     made.pivot.zero_()
     made.alike.fill_(1.0)
-    door = shells(1600, open_by=-1.0, reach=0.07)[0]
+    door, half = shells(1600, open_by=-1.0, reach=0.07)
     door.alike.zero_()
+    door.logit.data = 6.0 * F.one_hot((half & (torch.arange(1600) % 2 == 0)).long(), 2)  # a quarter
     for shape in (made, door):
         logit, pivot = shape.logit.clone(), shape.pivot.clone()
         state = torch.zeros(2, 1)
