@@ -31,12 +31,13 @@ METRICS = {
     "t": ("part_translation_r4", 1.0, ".3f"),
 }
 """Key in a report's summary, factor, and how a table prints it."""
-COSTS = ("seconds_per_cloud", "training_seconds", "training_gigabytes")
+COSTS = ("seconds_per_cloud", "training_seconds", "training_gigabytes", "threads")
 MODES = ("fast", "quick", "refine")
 KEYS = ["mode", "part", "category", "seed"]
 TITLE = """**Template registration, trained by several seeds**, `val`: mean [95 % interval over
-objects] of S (%), D (degrees), C, R (degrees) and t; clouds a second as the run asked them (in
-batches, one thread); minutes of training and memory at its peak, beside whatever else ran."""
+objects] of S (%), D (degrees), C, R (degrees) and t; clouds a second as the run asked them, in
+batches; minutes of training and memory at its peak; by so many threads, beside whatever else
+ran."""
 
 
 def reports_of(archive: Path) -> dict[str, bytes]:
@@ -75,7 +76,7 @@ def numbers(name: str, report: dict[str, Any]) -> list[dict[str, Any]]:
         "category": report["category"],
         "seed": report["seed"],
     }
-    budget = report["budget"]
+    budget = report["budget"] | {"threads": report["run"]["machine"]["threads"]}
     rows = [{**key, "what": what, "value": round(factor * one["mean"], 6),
              "low": round(factor * one["low"], 6), "high": round(factor * one["high"], 6)}
             for what, (metric, factor, _) in METRICS.items()
@@ -89,8 +90,10 @@ def _line(rows: pd.DataFrame) -> str:
     cells = [f"{at.value[w]:{f}} [{at.low[w]:{f}}, {at.high[w]:{f}}]"
              for w, (_, _, f) in METRICS.items()]  # fmt: skip
     cost = {w: float(at.value[w]) if w in at.index else float("nan") for w in COSTS}
-    cells += [f"{1 / cost['seconds_per_cloud']:.1f}", f"{cost['training_seconds'] / 60:.0f}",
-              f"{cost['training_gigabytes']:.2f}", first.commit]  # fmt: skip
+    minutes = cost["training_seconds"] / 60
+    cells += [f"{1 / cost['seconds_per_cloud']:.1f}", f"{minutes:.0f}",
+              f"{cost['training_gigabytes']:.2f}", f"{cost['threads']:.0f}"]  # fmt: skip
+    cells.append(first.commit)
     return f"| {first.category} ({first.part}) | {first.seed} | {' | '.join(cells)} |"
 
 
@@ -112,8 +115,9 @@ def markdown(rows: pd.DataFrame) -> str:
     lines = [TITLE]
     for mode, of_mode in rows.groupby("mode"):
         lines += ["", f"## `{mode}`", "",
-                  f"| category | seed | {' | '.join(METRICS)} | clouds/s | min | GB | commit |",
-                  "|---" * 7 + "|---:|---:|---:|---|"]  # fmt: skip
+                  f"| category | seed | {' | '.join(METRICS)} | clouds/s | min | GB | threads | "
+                  "commit |",
+                  "|---" * 7 + "|---:" * 4 + "|---|"]  # fmt: skip
         lines += [_line(one) for _, one in of_mode.groupby(KEYS)]
     if rows.groupby(KEYS[:3]).seed.nunique().max() > 1:
         lines += ["", "## Apart", "", "Largest less least over the seeds.", "", *_spread(rows)]

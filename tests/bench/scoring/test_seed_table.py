@@ -30,7 +30,7 @@ def report(out: Path, seed: int, mode: str, mean: float) -> None:
     variant = "objects" + ("" if mode == "fast" else f"-{mode}")
     path.write_text(json.dumps({
         "category": "laptop", "seed": seed, "variant": variant, "budget": budget,
-        "summary": summary, "run": {"commit": "abc"}
+        "summary": summary, "run": {"commit": "abc", "machine": {"threads": 2}}
     }))  # fmt: skip
     path.with_name(path.name.replace(".json", ".one-order.json")).write_text("{}")
 
@@ -49,7 +49,7 @@ def test_reports_of_several_runs_make_one_table(tmp_path: Path) -> None:
     assert numbers["refine", 2, "R"] == 0.8
     text = out.with_suffix(".md").read_text()
     assert "| laptop (clean) | 1 | 70.0 [60.0, 80.0] | 0.7 [0.6, 0.8] | 0.700" in text
-    assert "| 4.0 | 10 | 1.04 | abc |" in text
+    assert "| 4.0 | 10 | 1.04 | 2 | abc |" in text
     assert "| refine | laptop (clean) | 1, 2 | 30.0 | 0.3 | 0.300 | 0.3 | 0.300 |" in text
     assert "| fast | laptop (clean) | 1, 2" not in text
 
