@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 LONGEST = 2000
@@ -90,6 +90,26 @@ def unknown_word(kind: str, word: str, known: Iterable[str]) -> str:
     names = list(known)
     expected = f"expected one of {', '.join(names)}, found none"
     return f"{kind} {word!r}: {expected}{did_you_mean(word, names)}"
+
+
+def empty_flag(words: Sequence[str], several: Iterable[str]) -> str | None:
+    """What to say of a command whose flag has nothing to it, as "$UNSET" or $UNSET gives it one.
+
+    Args:
+        words: Of the command.
+        several: Flags that take any number of words, which would then be all that there are.
+
+    >>> empty_flag(["run", "--out", "", "--only"], ["--only"])
+    '--out: expected a value, found none'
+    >>> empty_flag(["run", "--only", "--out", "x"], ["--only"])
+    '--only: expected a value, found none'
+    """
+    listed = set(several)
+    for word, after in zip(words, [*words[1:], "--"], strict=True):
+        none = not after or word.endswith("=") or (word in listed and after.startswith("--"))
+        if word.startswith("--") and none:
+            return f"{word.rstrip('=')}: expected a value, found none"
+    return None
 
 
 def as_cell(text: str) -> str:

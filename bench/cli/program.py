@@ -18,7 +18,7 @@ from bench.cli.verbs import VERBS, prepare, train_verb
 from bench.requests import UsageError
 from scapo.interrupt import exit_if_unheard, exit_interrupted
 from scapo.ranges import check_numbers
-from scapo.text import unknown_word, words_of
+from scapo.text import empty_flag, unknown_word, words_of
 
 DESCRIPTION = (
     "Train, predict, score and tabulate methods of articulated pose estimation "
@@ -34,11 +34,11 @@ def _commands(words: Sequence[str], preset: str | None) -> Any:  # noqa: ANN401 
     return Union[tuple(commands)]  # noqa: UP007 - the tuple is not known to the type checker
 
 
-def _check_names(words: Sequence[str]) -> None:
-    """Refuse a verb or a method that is none, with the one that looks like it.
+def _check_words(words: Sequence[str]) -> None:
+    """Refuse a verb or a method that is none, and a flag with nothing to it.
 
     Raises:
-        UsageError: Naming those that there are.
+        UsageError: Naming those that there are, the one that looks like it, or the flag.
     """
     kinds = [("verb", VERBS)]
     if words[:1] == ["train"]:
@@ -48,6 +48,8 @@ def _check_names(words: Sequence[str]) -> None:
     for word, (kind, known) in zip(words, kinds, strict=False):
         if not word.startswith("-") and word.replace("_", "-") not in known:
             raise UsageError(unknown_word(kind, word, known))
+    if said := empty_flag(words, ("--only", "--splits")):
+        raise UsageError(said)
 
 
 def run(arguments: Sequence[str] | None = None) -> None:
@@ -61,7 +63,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
         format="%(message)s", handlers=[RichHandler(console=console, show_path=False)]
     )
     try:
-        _check_names(words)
+        _check_words(words)
         command: Any = tyro.cli(
             _commands(words[:1], preset),
             prog="scapo-bench",

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from scapo.interrupt import exit_if_unheard, exit_interrupted
 from scapo.ranges import check_numbers
-from scapo.text import unknown_word, words_of
+from scapo.text import empty_flag, unknown_word, words_of
 from sim_assets.cli.console import say
 from sim_assets.cli.verbs import VERBS, UsageError
 
@@ -48,6 +48,8 @@ def run(arguments: Sequence[str] | None = None) -> None:
     try:
         if words and not words[0].startswith("-") and words[0] not in VERBS:
             raise UsageError(unknown_word("verb", words[0], VERBS))
+        if said := empty_flag(words, ["--only"]):
+            raise UsageError(said)
         command: Any = tyro.cli(
             _commands(),
             prog="scapo-data",

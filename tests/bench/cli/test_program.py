@@ -87,3 +87,20 @@ def test_numbers_that_cannot_be_are_refused_before_any_work(
     assert len(lines) == 1
     assert lines[0].startswith(f"scapo-bench: {said}")
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "flag"),
+    [
+        (["run", "cpu", "--only"], "--only"),
+        (["run", "cpu", "--splits", "--out", "x"], "--splits"),
+        (["tables", "--scores", ""], "--scores"),
+    ],
+)
+def test_a_flag_with_nothing_to_it_is_refused_before_any_work(
+    words: list[str], flag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(words)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"scapo-bench: {flag}: expected a value, found none\n"

@@ -37,3 +37,20 @@ def test_a_verb_that_is_none_is_told_the_one_that_looks_like_it(
     said = capsys.readouterr().err
     assert said.startswith("scapo-data: verb 'generat': expected one of doctor, ")
     assert said.endswith("did you mean 'generate'?\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "flag"),
+    [
+        (["benchmark", "sim-art/2", "--only", "--out", "x"], "--only"),
+        (["generate", "oven", "--source=", "--out", "x"], "--source"),
+        (["generate", "oven", "--out", ""], "--out"),
+    ],
+)
+def test_a_flag_with_nothing_to_it_is_refused_before_any_work(
+    words: list[str], flag: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(words)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == f"scapo-data: {flag}: expected a value, found none\n"
