@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scapo.alignment import Alignment, unit_length
+from scapo.alignment import Alignment
+from scapo.answer import answered
 from scapo.method import AbstractMethod, Mode
 from scapo.records import map_tensors
 from scapo.registry import load_method
@@ -119,15 +120,8 @@ class Predictor:
             sensor=centre,
             up=None if up is None else self._unit(up).expand(*shape, 3).reshape(-1, 3),
         )
-        found = self.model.predict(observation, mode)
-        found = found if own_frame else self._in_object_frame(found, observation)
+        found = answered(self.model, observation, mode, None if own_frame else self.alignment)
         return map_tensors(found, lambda one: one.reshape((*shape, *one.shape[1:])).cpu())
-
-    def _in_object_frame(self, prediction: Prediction, observation: Observation) -> Prediction:
-        if self.alignment is None:
-            return prediction
-        unit = unit_length(observation.points)
-        return self.alignment.apply(prediction, unit, self.model.category)
 
     def _unit(self, up: np.ndarray | Tensor) -> Tensor:
         way = self._tensor(up)

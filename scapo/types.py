@@ -143,5 +143,8 @@ class Prediction:
     joint_limits: Float[Tensor, "*B J 2"] | None = None
     """Lowest and highest state that the method knows of, as `joints.state`."""
     confidence: Float[Tensor, "*B"] | None = None
+    misfit: Float[Tensor, "*B"] | None = None
+    """What the answer leaves unexplained, in the method's own measure: of two to clouds that are
+    each other's mirror image the lower is better."""
     record: Mapping[str, Tensor] | None = None
     """Network-side quantities that a published evaluator needs, by its names, batch first."""

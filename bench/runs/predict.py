@@ -18,7 +18,8 @@ from bench.requests import PredictRequest
 from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
 from bench.scoring.scores import to_arrays
-from scapo.alignment import Alignment, ObjectFrame, unit_length
+from scapo.alignment import Alignment, ObjectFrame
+from scapo.answer import answered
 from scapo.method import AbstractMethod, OracleMethod, evenly
 from scapo.records import map_tensors
 from scapo.released import find as find_checkpoint
@@ -159,10 +160,7 @@ def _answer(
         observation = replace(observation, up=batch["camera_T_part"][:, 0, :3, 2])
     if request.oracle and isinstance(method, OracleMethod):
         return to_arrays(method.predict_given(observation, label(batch).keep(method.oracle)))
-    found = method.predict(observation, request.mode)
-    if alignment is not None:
-        found = alignment.apply(found, unit_length(observation.points), method.category)
-    return to_arrays(found)
+    return to_arrays(answered(method, observation, request.mode, alignment))
 
 
 def joined(parts: Sequence[Arrays], chosen: Int[np.ndarray, " K"], count: int) -> Arrays:

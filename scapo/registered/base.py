@@ -318,8 +318,8 @@ class AbstractRegistered(AbstractMethod):
         seen = self._seen(observation)
         alone = mode == "fast" and self._has_learned()
         said = self._voted(seen) if alone else self._searched(seen, mode)
-        chosen = turn_placement(said.placement, seen.frame.mT)
-        return self._answer(chosen, said.part_weight, seen.similarity, said.sure)
+        said = replace(said, placement=turn_placement(said.placement, seen.frame.mT))
+        return self._answer(said, seen.similarity)
 
     def _of_surfaces(self, observation: Observation) -> Prediction:
         """Of clouds that show all of an object, not the side that a camera sees.
@@ -336,7 +336,8 @@ class AbstractRegistered(AbstractMethod):
             placement = upright.raised(self.template, placement)
         normals = torch.zeros_like(clouds)  # Which way a surface faces is not known
         weight = nearest_weights(self.template, clouds, normals, placement)
-        return self._answer(placement, weight, similarity, sure)
+        said = Said(placement=placement, part_weight=weight, sure=sure)
+        return replace(self._answer(said, similarity), misfit=None)  # shares of votes tell none
 
     def _of_view(
         self, observation: Observation
@@ -396,20 +397,17 @@ class AbstractRegistered(AbstractMethod):
         raised = upright.raised(self.template, said.placement)
         return replace(said, placement=raised, sure=said.sure * level)
 
-    def _answer(
-        self,
-        placement: Placement,
-        part_weight: Float[Tensor, "B N P"],
-        similarity: Similarity,
-        confidence: Float[Tensor, " B"],
-    ) -> Prediction:
+    def _answer(self, said: Said, similarity: Similarity) -> Prediction:
         """What a placement stands for, with the states that were seen in training as limits."""
-        rest, origin = self._rest(placement), self._origin()
-        plain = placed_prediction(self.template, placement, rest, origin, part_weight, similarity)
+        rest, origin = self._rest(said.placement), self._origin()
+        plain = placed_prediction(
+            self.template, said.placement, rest, origin, said.part_weight, similarity
+        )
         limits = None
         if bool((self.pseudo.trust > 0).any()):  # else it is not trained yet
             limits = metric_limits(self.template, self._limits(), rest, similarity)
-        return replace(plain, joint_limits=limits, confidence=confidence)
+        misfit = 1 - said.sure if said.loss is None else said.loss
+        return replace(plain, joint_limits=limits, confidence=said.sure, misfit=misfit)
 
     def _camera(
         self, observation: Observation, similarity: Similarity, kept: Float[Tensor, "B K 3"]
@@ -438,7 +436,7 @@ class AbstractRegistered(AbstractMethod):
         if said is not None:
             final = hinged_as(self.template, said.placement, final)
         weight = seen.part_weights(self.template, final, said)
-        return Said(placement=final, part_weight=weight, sure=found.margin)
+        return Said(placement=final, part_weight=weight, sure=found.margin, loss=found.loss)
 
     def _said(self, seen: SeenClouds) -> Said | None:
         """What the network that knows cameras says; None without one."""

@@ -63,6 +63,8 @@ class Said:
     part_weight: Float[Tensor, "B N P"]
     sure: Float[Tensor, " B"]
     """Of the network 1 where its votes agree, to 0; of a search the margin of the best."""
+    loss: Float[Tensor, " B"] | None = None
+    """Of a search: of the best."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
