@@ -45,6 +45,15 @@ class NetworkConfig:
     """Compute what the space convolutions correlate again for the gradient, which keeps a
     fraction of the memory and takes a third more time."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for channels that are not shared evenly by the frames."""
+        sizes = (*self.widths, self.code)
+        if self.frames > 0 and any(size % self.frames for size in sizes):
+            raise ValueError(
+                f"network.frames: expected a divisor of all widths and of the code, "
+                f"{', '.join(map(str, sizes))}, found {self.frames}"
+            )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import pytest
 import torch
 from torch.testing import assert_close
 
@@ -79,3 +80,9 @@ def test_every_point_is_spoken_of_by_itself() -> None:
     with torch.no_grad():
         whole, one = network(points, asked), network(points, asked[:, 5:6])
     assert_close(one.coordinate, whole.coordinate[:, 5:6], atol=1e-5, rtol=0)
+
+
+def test_channels_that_frames_cannot_share_evenly_are_refused() -> None:
+    words = "network.frames: expected a divisor of all widths and of the code, 8, 8, 8, found 3"
+    with pytest.raises(ValueError, match=words):
+        replace(SIZES, frames=3)
