@@ -85,26 +85,28 @@ def read_input(path: Path, options: ReadOptions) -> Cloud:
         raise InputError(f"{path}: expected one of {' '.join(SUFFIXES)}, found {suffix or 'none'}")
     if not path.is_file():
         raise InputError(f"{path}: expected a file, found none")
-    if suffix in DEPTH_SUFFIXES:
-        beside = companions(path)
-        return read_depth(
-            path, options.intrinsics or beside.intrinsics, options.mask or beside.mask,
-            options.scale,
-        )  # fmt: skip
+    read = _read_depth if suffix in DEPTH_SUFFIXES else _read_cloud
+    cloud = read(path, options)
+    return cloud if options.up is None else replace(cloud, up=np.array(options.up, np.float64))
+
+
+def _read_depth(path: Path, options: ReadOptions) -> Cloud:
+    if options.sensor is not None:
+        raise InputError(
+            f"{path}: expected a cloud with --sensor, found a depth image, which is in its "
+            "camera's frame"
+        )
+    beside = companions(path)
+    mask = options.mask or beside.mask
+    return read_depth(path, options.intrinsics or beside.intrinsics, mask, options.scale)
+
+
+def _read_cloud(path: Path, options: ReadOptions) -> Cloud:
     if options.mask is not None or options.intrinsics is not None:
         raise InputError(
             f"{path}: expected a depth image with --mask and --intrinsics, found a cloud"
         )
-    cloud = _read_cloud(path, suffix, options.scale)
-    if options.sensor is not None:
-        cloud = replace(cloud, sensor=np.array(options.sensor, np.float64))
-    if options.up is not None:
-        cloud = replace(cloud, up=np.array(options.up, np.float64))
-    return check_sensor(cloud)
-
-
-def _read_cloud(path: Path, suffix: str, scale: float | None) -> Cloud:
-    sensor = None
+    suffix, sensor = path.suffix.lower(), None
     if suffix == ".ply":
         points, color = _read_ply(path)
     elif suffix == ".pcd":
@@ -112,8 +114,12 @@ def _read_cloud(path: Path, suffix: str, scale: float | None) -> Cloud:
         points, color, sensor = found.points, found.color, found.sensor
     else:
         points, color, sensor = _read_npz(path)
-    cloud = made_fit(str(path), points, color, scale)
-    return cloud if sensor is None else replace(cloud, sensor=sensor * (scale or 1.0))
+    if options.sensor is not None:
+        sensor = np.array(options.sensor, np.float64)
+    elif sensor is not None:
+        sensor = sensor * (options.scale or 1.0)
+    cloud = made_fit(str(path), points, color, options.scale)
+    return check_sensor(replace(cloud, sensor=sensor))
 
 
 def _read_ply(path: Path) -> tuple[Num[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"] | None]:

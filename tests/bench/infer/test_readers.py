@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from bench.infer.cloud import InputError
 from bench.infer.readers import ReadOptions, find_inputs, read_input
@@ -168,6 +169,21 @@ def test_flags_of_depth_images_are_refused_for_clouds(tmp_path):
         read_input(path, ReadOptions(mask=Path("m.png")))
     with pytest.raises(InputError, match="expected a file, found none"):
         read_input(tmp_path / "b.ply", ReadOptions())
+
+
+def test_a_depth_image_has_an_up_as_a_cloud_has(tmp_path):
+    path = tmp_path / "a.png"
+    Image.fromarray(np.full((48, 64), 900, np.uint16)).save(path)
+    found = read_input(path, ReadOptions(intrinsics="60,60,32,24", up=(0, -1, 0)))
+    assert found.up is not None
+    assert found.up.tolist() == [0, -1, 0]
+
+
+def test_a_depth_image_is_in_the_frame_of_its_camera(tmp_path):
+    path = tmp_path / "a.png"
+    Image.fromarray(np.full((48, 64), 900, np.uint16)).save(path)
+    with pytest.raises(InputError, match=r"a\.png: expected a cloud with --sensor, found a depth"):
+        read_input(path, ReadOptions(intrinsics="60,60,32,24", sensor=(0, 1, 0)))
 
 
 def test_a_folder_stands_for_what_can_be_read_in_it(tmp_path):
