@@ -140,6 +140,8 @@ class Predictor:
             values = np.asarray(values)
             if values.dtype.kind not in "fiub":
                 raise ValueError(f"expected real numbers, found an array of {values.dtype}")
+            with np.errstate(over="ignore"):  # an infinity, which is refused where it may not be
+                values = np.array(values, np.float32, order="C")  # any strides and byte order
         elif values.is_complex():
             raise ValueError(f"expected real numbers, found a tensor of {values.dtype}")
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)

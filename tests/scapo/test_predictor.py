@@ -72,6 +72,22 @@ def test_a_stored_alignment_is_applied_unless_own_frames_are_asked_for(saved: Pa
     assert_close(nested[:, 0], found.camera_T_part)
 
 
+@pytest.mark.parametrize("kind", ["backwards", "columns", "big-endian", "read-only", "double"])
+def test_how_an_array_lies_in_memory_changes_no_answer(saved: Path, kind: str) -> None:
+    points = plates(2, 96)[0].points.numpy()
+    fixed = points.copy()
+    fixed.flags.writeable = False
+    other = {
+        "backwards": np.ascontiguousarray(points[:, ::-1])[:, ::-1],
+        "columns": np.asfortranarray(points),
+        "big-endian": points.astype(">f4"),
+        "read-only": fixed,
+        "double": points.astype(np.float64),
+    }[kind]
+    wanted = load(saved).predict(torch.from_numpy(points))
+    assert_close(load(saved).predict(other).camera_T_part, wanted.camera_T_part)
+
+
 @pytest.mark.parametrize("shape", [(3,), (96, 2), (4, 3)])
 def test_other_shapes_are_refused(saved: Path, shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"points: expected shape \(..., N, 3\) with N at least 6"):
