@@ -39,6 +39,7 @@ from scapo.released import find
 from scapo.store import Split, StoreError, open_split
 from scapo.store.checkpoint import weights_file
 from scapo.store.files import require_suffix
+from scapo.store.samples import observed
 
 FOLDS = 5
 """Of the objects: probabilities that `reliability` judges come from maps fitted without them."""
@@ -54,6 +55,14 @@ class Labelled:
     camera_T_part: Float[np.ndarray, "S P 4 4"]
     axis: Float[np.ndarray, "S J 3"]
     instance: Int[np.ndarray, " S"]
+    sensor: Float[np.ndarray, "S 3"] | None
+    """None: the clouds are in their cameras' frames."""
+
+    def clouds(self) -> list[Cloud]:
+        """As `infer` would have read them."""
+        centres = [None] * len(self.points) if self.sensor is None else self.sensor
+        pairs = zip(self.points, centres, strict=True)
+        return [Cloud(points=points, sensor=sensor) for points, sensor in pairs]
 
 
 def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibration, list[Path]]:
@@ -75,7 +84,7 @@ def calibrate(request: CalibrateRequest, watch: Watch = iter) -> tuple[Calibrati
     own = load_model(file, pick_device(request.device), None)
     split = open_split(request.data, own.category.name, request.split)
     labelled = _labelled(split, request.limit)
-    clouds = [Cloud(points=points) for points in labelled.points]
+    clouds = labelled.clouds()
     model = _in_object_frame(own, split, request)
     found = Calibration(
         model=model.digest,
@@ -137,8 +146,8 @@ def _labelled(split: Split, limit: int | None) -> Labelled:
     Raises:
         StoreError: Too few.
     """
-    names = ("points", "camera_T_part", "joint_axis", "instance")
-    arrays = split.arrays(*names)
+    sensor = {"sensor"} & set(observed(split))
+    arrays = split.arrays("points", "camera_T_part", "joint_axis", "instance", *sensor)
     total = len(arrays["points"])
     index = evenly(total, limit).numpy()
     if len(index) < LEAST_SAMPLES:
@@ -151,6 +160,7 @@ def _labelled(split: Split, limit: int | None) -> Labelled:
         camera_T_part=some["camera_T_part"].astype(np.float64),
         axis=some["joint_axis"].astype(np.float64),
         instance=some["instance"].astype(int),
+        sensor=some.get("sensor"),
     )
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -12,7 +13,9 @@ from bench.infer.calibrate import calibrate
 from bench.infer.calibration import read_calibration
 from bench.requests import CalibrateRequest
 from scapo.store.checkpoint import WEIGHTS
+from scapo.store.samples import TENSORS
 from scapo.store.schema import StoreError
+from tests.helpers.made import write_split
 from tests.helpers.placed import Told, placed_run, told_model, told_split
 
 COUNT = 24
@@ -61,3 +64,24 @@ def test_too_few_samples_are_refused(told, data, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="expected at least 20 samples, found 10"):
         calibrate(request)
     assert [path.name for path in run.iterdir()] == [WEIGHTS]
+
+
+def test_clouds_in_another_frame_are_asked_with_the_place_of_their_camera(
+    told, tmp_path, monkeypatch
+):
+    split = told_split(told, tmp_path / "plain", "val")
+    place = np.random.default_rng(0).normal(size=(COUNT, 3)).astype(np.float32)
+    arrays = {**split.arrays(*TENSORS), "sensor": place}
+    write_split(tmp_path / "data", "oven", "val", arrays)
+    asked = []
+
+    def noting(name, cloud, *words):
+        asked.append(cloud.sensor)
+        return answer.ask(name, cloud, *words)
+
+    monkeypatch.setattr(room, "load_model", lambda *_: told_model(told))
+    monkeypatch.setattr(room, "ask", noting)
+    monkeypatch.setattr(answer, "RESAMPLES", 1)
+    run = placed_run(tmp_path / "run")
+    calibrate(CalibrateRequest(checkpoint=str(run), data=tmp_path / "data", device="cpu"))
+    np.testing.assert_array_equal(asked, place)
