@@ -75,6 +75,7 @@ def ask(name: str, cloud: Cloud, model: Model, mode: Mode) -> Twin:
         name=name,
         category=model.category,
         points=cloud.points,
+        frame="input" if cloud.sensor is not None and cloud.sensor.any() else "camera",
         part=label[near],
         color=cloud.color,
         camera_T_part=parts.camera_T_part,

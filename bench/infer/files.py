@@ -50,8 +50,6 @@ class Result:
     """Why there are no confidences; None where there are."""
     aligned: bool
     """Whether frames, order of parts and zeros of states are the category's."""
-    frame: str = "camera"
-    """camera, or input where the cloud came in another one."""
 
 
 def joints_record(result: Result) -> dict[str, Any]:
@@ -60,7 +58,7 @@ def joints_record(result: Result) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "input": twin.name,
-        "frame": result.frame,
+        "frame": twin.frame,
         "units": {"length": "m", "angle": "rad"},
         "category": {
             "name": twin.category.name,

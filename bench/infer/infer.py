@@ -129,14 +129,12 @@ def answer(name: str, cloud: Cloud, models: Sequence[Model], mode: Mode, given: 
         words = f"the category is doubtful: {rival} explains the view almost as well; --category"
         twin = replace(twin, warnings=(*twin.warnings, words))
     twin, reason = with_confidence(twin, models[best].calibration)
-    away = cloud.sensor is not None and bool(cloud.sensor.any())
     return Result(
         twin=twin,
         choice=choice,
         mode=mode,
         uncalibrated=reason,
         aligned=models[best].predictor.in_object_frame,
-        frame="input" if away else "camera",
     )
 
 

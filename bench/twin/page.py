@@ -140,7 +140,10 @@ def _numbers(twin: Twin) -> str:
         sure = "not calibrated" if known is None else f"{known[p]:.0%} within 10°"
         parts.append([name, f"{int((twin.part == p).sum()):,}", sure])
     heads = ["joint of", "pivot, cm", "axis", "state", "confidence of the axis"]
-    text = _table("Joints in the camera's frame: x right, y down, z forward.", heads, joints)
+    frame = "camera's frame: x right, y down, z forward" if twin.frame == "camera" else (
+        "frame of the input"
+    )  # fmt: skip
+    text = _table(f"Joints in the {frame}.", heads, joints)
     text += _table("Parts.", ["part", "points", "confidence of the rotation"], parts)
     if twin.evidence:
         rows = [[name, f"{value:.4g}"] for name, value in sorted(twin.evidence.items())]

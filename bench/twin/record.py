@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
 """What is known of one observed object: a plain frozen record, from which files are written.
 
-Camera frame (x right, y down, z forward), metres and radians throughout. `N` observed points, `M`
-points of the model's shape, `P` parts, `J` joints; joint j moves part `category.joints[j].child`.
+Camera frame (x right, y down, z forward), or that of the input (`Twin.frame`); metres and radians
+throughout. `N` observed points, `M` points of the model's shape, `P` parts, `J` joints; joint j
+moves part `category.joints[j].child`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -39,6 +41,8 @@ class Twin:
     category: Category
     points: Float[np.ndarray, "N 3"]
     """As observed, finite."""
+    frame: Literal["camera", "input"] = "camera"
+    """input: all is in another frame than the camera's, in which the points came."""
     part: Int[np.ndarray, " N"]
     """Index into `category.parts`, or `BACKGROUND`."""
     color: UInt8[np.ndarray, "N 3"] | None = None

@@ -42,6 +42,9 @@ def test_the_truth_is_handed_on_in_the_cameras_frame(told):
         own = KDTree(twin.shape.points[twin.shape.part == part])
         assert np.median(own.query(twin.points[twin.part == part])[0]) < 0.03
     assert twin.model == {"name": "told", "method": "told", "sha256": "0" * 64}
+    assert twin.frame == "camera"
+    elsewhere = Cloud(points=told.clouds()[0], sensor=np.array([0, 0, 0.1]))
+    assert ask("a", elsewhere, told_model(told), "fast").frame == "input"
 
 
 def test_a_wrong_answer_has_a_larger_residual_and_draws_that_differ_a_larger_spread(told):

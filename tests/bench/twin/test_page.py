@@ -62,6 +62,15 @@ def test_the_model_is_named_whole_and_its_digest_in_short(twin: Twin, tmp_path: 
     assert "model: name oven, method registered-labelled, sha256 0123456789ab<" in page
 
 
+def test_the_frame_of_the_numbers_is_said(twin: Twin, tmp_path: Path):
+    for frame, words in (
+        ("camera", "Joints in the camera&#x27;s frame: x right, y down, z forward."),
+        ("input", "Joints in the frame of the input."),
+    ):
+        page = write_page(replace(twin, frame=frame), tmp_path / "page.html").read_text()
+        assert words in page
+
+
 def test_it_carries_the_numbers_and_the_files(folder: Path, tmp_path: Path):
     page = (folder / "page.html").read_text()
     for words in ("34.4°", "85.9°", "87% within 5°", "64% within 10°", "0.0123", "registered"):
