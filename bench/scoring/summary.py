@@ -23,12 +23,17 @@ PRECISION_INPUTS = (
 
 
 def passes(errors: Errors, rule: ApRule) -> dict[str, np.ndarray]:
-    """What the average precision counts; empty where one of its inputs is not there."""
+    """What the average precision counts; empty where one of its inputs is not there.
+
+    Without that of parts or of joints where no sample has any value of them: who gives no poses
+    has no precision of poses, rather than one of 0.
+    """
     if any(key not in errors for key in PRECISION_INPUTS):
         return {}
-    return precision_passes(
-        **{name: errors[name, unit] for name, unit in PRECISION_INPUTS}, rule=rule
-    )
+    inputs = {name: errors[name, unit] for name, unit in PRECISION_INPUTS}
+    silent = {name.partition("_")[0] for name, values in inputs.items() if np.isnan(values).all()}
+    passed = precision_passes(**inputs, rule=rule)
+    return {key: value for key, value in passed.items() if key.partition("_")[0] not in silent}
 
 
 def swapped(order: Float[np.ndarray, "B P"]) -> Float[np.ndarray, "B 1"]:

@@ -174,6 +174,7 @@ class Sampled:
     cell: Cell
     means: Float[np.ndarray, " R"]
     per_seed: tuple[float, ...]
+    unit: str = "1"
 
 
 def measured(runs: Sequence[Scores], measure: Measure, seed: int) -> Sampled | None:
@@ -183,7 +184,8 @@ def measured(runs: Sequence[Scores], measure: Measure, seed: int) -> Sampled | N
     tables = [measure.factor * (swapped(t) if key[0] == "order" else t) for t in tables]
     if not tables or all(np.isnan(table).all() for table in tables):
         return None
-    return _marked(_sampled(runs, tables, measure.decimals, seed), runs, measure.metric)
+    sampled = replace(_sampled(runs, tables, measure.decimals, seed), unit=measure.unit)
+    return _marked(sampled, runs, measure.metric)
 
 
 def _marked(sampled: Sampled, runs: Sequence[Scores], metric: str) -> Sampled:
@@ -264,9 +266,13 @@ def _same_samples(runs: Sequence[Scores]) -> Int[np.ndarray, " B"]:
 
 
 def averaged(parts: Sequence[Sampled | None]) -> Cell:
-    """The mean over categories, from unrounded cells; empty unless every category was run."""
+    """The mean over categories, from unrounded cells.
+
+    Empty unless every category was run, and where they have two units: the states of drawers are
+    lengths, those of other joints angles.
+    """
     known = [part for part in parts if part is not None]
-    if len(known) < len(parts) or not known:
+    if len(known) < len(parts) or len({part.unit for part in known}) != 1:
         return Cell()
     values = [part.cell.value for part in known if part.cell.value is not None]
     size = min(len(part.means) for part in known)

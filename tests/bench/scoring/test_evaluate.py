@@ -187,7 +187,19 @@ def test_labels_alone_leave_the_rest_empty(laptop, tmp_path):
     for (name, _), value in errors.items():
         assert name in ("iou", "order") or np.isnan(value).all()
     assert report["summary"]["part_rotation_deg"]["mean"] is None
-    assert report["average_precision"]["part_15"] == {"k": 0, "n": 11, "low": 0.0, "high": 0.0}
+    assert set(report["average_precision"]) == {"rule", "seg_50", "seg_75"}
+    assert report["average_precision"]["seg_75"]["k"] == 11
+
+
+def test_who_never_gives_poses_has_no_precision_of_them_and_who_fails_once_has(laptop, tmp_path):
+    arrays = made.truth_as_prediction(laptop)
+    arrays["camera_T_part"][1:] = np.nan
+    _, report = score(laptop, arrays, tmp_path)
+    assert [report["average_precision"]["part_15"][name] for name in "kn"] == [1, 11]
+    arrays["camera_T_part"][:] = np.nan
+    _, report = score(laptop, arrays, tmp_path)
+    assert "part_15" not in report["average_precision"]
+    assert report["average_precision"]["joint_15"]["k"] == 11
 
 
 def test_names_of_data(tmp_path):

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import gzip
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from bench.scoring.score_files import read_scores, side_file
 from bench.tables import write as tables
-from bench.tables.results import Series, kind_of, load, series_of
+from bench.tables.model import Cell
+from bench.tables.results import Sampled, Series, averaged, kind_of, load, series_of
 from scapo.store import StoreError
 from tests.helpers.scored import SAMPLES, make_scores
 
@@ -43,6 +46,12 @@ def test_two_data_sets_are_not_mixed(tmp_path):
     make_scores(tmp_path, "icp", "laptop", digest="ffffffffffff")
     with pytest.raises(StoreError, match=r"expected scores on clean@.* like .*, found clean@"):
         load(tmp_path)
+
+
+def test_states_in_degrees_and_in_centimetres_have_no_mean():
+    turns = Sampled(cell=Cell(value=4.0), means=np.ones(3), per_seed=(4.0,), unit="deg")
+    assert averaged([turns, turns]).value == 4
+    assert averaged([turns, replace(turns, unit="m")]).value is None
 
 
 def test_a_run_is_not_counted_twice(tmp_path):
