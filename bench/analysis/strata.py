@@ -34,17 +34,18 @@ the data say so."""
 
 
 def factors(truth: Truth, manifest: Manifest) -> dict[str, Float[np.ndarray, " B"]]:
-    """The value of every factor for some samples.
+    """The value of every factor for some samples, NaN where the data do not say it.
 
     Azimuth and elevation are those of the camera about the object's origin (`categories.Window`).
     """
-    upper = np.array([max(joint.upper, 1e-12) for joint in manifest.joints])
+    lower = np.array([joint.lower for joint in manifest.joints])
+    travel = np.array([max(joint.upper - joint.lower, 1e-12) for joint in manifest.joints])
     pose = truth.camera_T_part[:, 0]
     camera = -np.einsum("bij,bi->bj", pose[:, :3, :3], pose[:, :3, 3])  # in the object frame
     x, y, z = camera.T
     values = {
         "visible": truth.visible[:, 1:].mean(1),
-        "state": (truth.joint_state / upper).mean(1),
+        "state": ((truth.joint_state - lower) / travel).mean(1),
         "azimuth": np.degrees(np.arctan2(-y, -x)),
         "elevation": np.degrees(np.arctan2(z, np.hypot(x, y))),
         "size": truth.scale,
@@ -85,15 +86,19 @@ def stratify(
 ) -> Iterator[Stratum]:
     """Means and intervals of every metric in every bin that has samples.
 
-    Values beyond the outer limits (a state past the category's travel) belong to the outer bins.
+    Values beyond the outer limits (a state past the category's travel) belong to the outer bins,
+    those that are not known to none.
     """
     for factor, value in values.items():
-        limits = edges(factor, value)
+        known = ~np.isnan(value)
+        if not known.any():
+            continue
+        limits = edges(factor, value[known])
         if len(limits) < 2:
-            limits = np.array([value.min(), value.max()])
+            limits = np.repeat(limits, 2)
         bins = np.clip(np.searchsorted(limits, value, "right") - 1, 0, len(limits) - 2)
         for number, (lower, upper) in enumerate(pairwise(limits)):
-            members = bins == number
+            members = known & (bins == number)
             if not members.any():
                 continue
             for (metric, unit), table in errors.items():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -191,6 +192,27 @@ def test_strata_hold_every_sample_once():
     assert states == sorted(states)
     sizes = [s.samples for s in strata if s.factor == "visible"]
     assert min(sizes) == max(sizes) == 40
+
+
+def test_samples_of_which_a_factor_is_not_known_are_in_none_of_its_bins():
+    values = {"state": np.array([0.1, np.nan, 0.9]), "visible": np.array([np.nan, 0.2, 0.3]),
+              "size": np.full(3, np.nan)}  # fmt: skip
+    strata = list(stratify({("iou", "1"): np.ones((3, 2))}, values, np.arange(3)))
+    bins = [(s.factor, s.lower, s.samples) for s in strata]
+    assert bins[:2] == [("state", 0, 1), ("state", pytest.approx(0.8), 1)]
+    assert sum(s.samples for s in strata if s.factor == "visible") == 2
+    assert all(np.isfinite([s.lower, s.upper]).all() for s in strata)
+    assert "size" not in {s.factor for s in strata}
+
+
+def test_a_state_is_a_share_of_the_travel_whatever_its_lower_limit(tmp_path):
+    arrays = made.sample_arrays("laptop", 3, 40)
+    arrays["joint_state"][:, 0] = [-0.5, 0.25, 1]
+    split = made.write_split(tmp_path, "laptop", "test", arrays)
+    (truth,) = blocks(split)
+    joint = replace(split.manifest.joints[0], lower=-0.5, upper=1.0)
+    found = factors(truth, replace(split.manifest, joints=(joint,)))
+    np.testing.assert_allclose(found["state"], [0, 0.5, 1], atol=1e-6)
 
 
 def test_references_bracket_a_method(split, tmp_path):
