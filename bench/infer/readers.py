@@ -173,8 +173,8 @@ def _read_npz(
         raise InputError(f"{path}: color: expected shape {points.shape}, found {color.shape}")
     if sensor is not None and (sensor.shape != (3,) or not np.isfinite(sensor).all()):
         raise InputError(f"{path}: sensor: expected 3 finite numbers, found {sensor.shape}")
-    if color is not None and color.dtype.kind == "f":  # in [0, 1]
-        color = np.nan_to_num(color * 255.0).clip(0, 255)
+    if color is not None and color.dtype.kind == "f":  # in [0, 1], or [0, 255]
+        color = np.nan_to_num(color * (1.0 if (color > 1).any() else 255.0)).clip(0, 255)
     return points, None if color is None else color.astype(np.uint8), sensor
 
 

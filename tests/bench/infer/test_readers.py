@@ -46,6 +46,7 @@ FILES = {
     "mesh.ply": ply(faces=FACES) + bytes([3, 0, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0]),
     "a.npz": npz(points=POINTS, color=COLOR),
     "double.npz": npz(points=POINTS.astype(float), color=COLOR / 255.0),
+    "bytes.npz": npz(points=POINTS, color=COLOR.astype(float)),
 }
 
 
