@@ -91,7 +91,7 @@ def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
         raise refuse(path, "a mesh with triangles", "none")
     for piece in pieces:
         check_mesh(path, piece.mesh)
-    return _both_sides(pieces, _unit(path, units))
+    return _both_sides([_without_strays(piece) for piece in pieces], _unit(path, units))
 
 
 def _claimed_faces(form: str, data: bytes) -> int:
@@ -177,6 +177,20 @@ def _rgba(color: object) -> Color:
         return GREY
     red, green, blue, alpha = np.append(values, 1.0)[:4].clip(0, 1).tolist()
     return red, green, blue, alpha
+
+
+def _without_strays(piece: Visual) -> Visual:
+    """Without vertices that no triangle names: they are nothing to see, and may lie anywhere."""
+    mesh = piece.mesh
+    used = used_vertices(mesh.faces)
+    if len(used) == len(mesh.vertices):
+        return piece
+    place = np.zeros(len(mesh.vertices), np.int64)
+    place[used] = np.arange(len(used))
+    kept = trimesh.Trimesh(mesh.vertices[used], place[mesh.faces], process=False, validate=False)
+    if isinstance(mesh.visual, TextureVisuals):
+        kept.visual = TextureVisuals(uv=mesh.visual.uv[used], material=mesh.visual.material)
+    return Visual(mesh=kept, color=piece.color)
 
 
 def _both_sides(pieces: list[Visual], scale: float) -> list[Visual]:

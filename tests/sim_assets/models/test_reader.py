@@ -148,6 +148,24 @@ def test_mesh_formats(form: str, tmp_path: Path):
     assert_is_cabinet(reader.read(urdf, "oven", root=tmp_path))
 
 
+@pytest.mark.parametrize("stray", ["-5 0 3", "nan 0 0", "0 inf 0"])
+def test_vertices_of_no_triangle_are_nothing_to_see(stray: str, tmp_path: Path):
+    """Left by a program that removed their triangles: they neither close a door nor frame it."""
+    urdf = cabinet(tmp_path, ("door.obj", "door.ply"))
+    door = trimesh.creation.box((0.02, 0.4, 0.6))
+    vertices = [*(" ".join(map(str, row)) for row in door.vertices), stray]
+    kinds = [f"property float {axis}" for axis in "xyz"]
+    head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}", *kinds]
+    head += [f"element face {len(door.faces)}", "property list uchar int vertex_indices"]
+    faces = [f"3 {i} {j} {k}" for i, j, k in door.faces]
+    text = "\n".join([*head, "end_header", *vertices, *faces, ""])
+    (tmp_path / "meshes/door.ply").write_text(text)
+    thing = reader.read(urdf, "oven", root=tmp_path)
+    assert thing.origin.rest == {"hinge": 0.0}
+    assert_is_cabinet(thing)
+    assert np.abs(thing.part_mesh(1).vertices).max() <= 0.3 + 1e-6
+
+
 def test_dae_in_inches(tmp_path: Path):
     urdf = cabinet(tmp_path, ("body.obj", "body.dae"))
     path = tmp_path / "meshes/body.dae"
