@@ -4,7 +4,7 @@
 Where the caller does not say where the front is, it is told from the joint. The source's own front
 goes before, unless a door or drawer plainly (within 26 degrees) opens another way:
 
-- a door or drawer: where it moves to when it begins to open;
+- a door or drawer: where it moves to when it begins to open; of several doors, on the mean;
 - a lid, also a washer's that opens upwards: from its hinge towards its middle, as a laptop's user
   sits opposite to the hinge;
 - eyeglasses: from the temples' middles to their hinges;
@@ -148,15 +148,16 @@ def told_front(
     if category.joints[0].kind == "prismatic":
         front = snapped(axis[0], up)
         return ToldFront(front=front, sure=bool(axis[0] @ front > SURE))
-    if len(category.joints) > 1:
-        return ToldFront(front=snapped((pivot - middle).mean(0), up), sure=False)
-    arm = middle[0] - pivot[0]
-    motion = np.cross(axis[0], arm)
+    arms = middle - pivot
+    motion = np.cross(axis, arms).mean(0)  # of two doors, which open to the same side
     level = motion - up * (motion @ up)
     door = "door" in category.words
     if door and np.linalg.norm(level) > 0.5 * np.linalg.norm(motion):
         front = snapped(level, up)
         return ToldFront(front=front, sure=bool(motion @ front > SURE * np.linalg.norm(motion)))
+    if len(category.joints) > 1:
+        return ToldFront(front=snapped(-arms.mean(0), up), sure=False)
+    arm = arms[0]
     return ToldFront(front=snapped(arm - axis[0] * (axis[0] @ arm), up), sure=False)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scapo.categories import category
+from scapo.categories import Category, JointSpec, Window, category
 from sim_assets.models import frames, reader
 from sim_assets.models import joints as rest
 from sim_assets.models.joints import words
@@ -104,6 +104,45 @@ def test_drawer(axis: str, limit: str, sign: float, tmp_path: Path):
     assert thing.origin.repairs == ("The front was told from the joint: y",)
     np.testing.assert_allclose(thing.upper, [0.3])
     np.testing.assert_allclose(thing.pivot[0], thing.part_mesh(1).bounds.mean(0), atol=1e-12)
+
+
+CUPBOARD = Category(
+    name="cupboard",
+    parts=("body", "left door", "right door"),
+    joints=(
+        JointSpec(kind="revolute", parent=0, child=1, lower=0.0, upper=1.9),
+        JointSpec(kind="revolute", parent=0, child=2, lower=0.0, upper=1.9),
+    ),
+    window=Window(azimuth=(-60, 60), elevation=(0, 55)),
+    diagonal=1.2,
+    words=("door",),
+)
+
+
+@pytest.mark.parametrize("quarters", range(4))
+def test_two_doors_open_at_the_front(quarters: int, tmp_path: Path):
+    """Hinged at the outer edges, so that their middles lie beside the hinges, not before them."""
+    turn = quarters * pi / 2
+    links = {"body": box((0.4, 0.8, 0.9), (0, 0, 0))}
+    joints = ""
+    for name, side in (("one", 1), ("two", -1)):
+        links[f"{name}_door"] = box((0.02, 0.4, 0.9), (-0.01, -0.2 * side, 0))
+        x, y = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ (
+            -0.2,
+            0.4 * side,
+        )
+        limit = "-1.9 0" if side > 0 else "0 1.9"
+        origin = f'xyz="{x} {y} 0" rpy="0 0 {turn}"'
+        joints += joint(f"{name}_hinge", ("body", f"{name}_door"), origin, "0 0 1", limit)
+    links["body"].apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
+    thing = reader.read(write(tmp_path, links, joints), CUPBOARD)
+    closed = [thing.part_mesh(part).bounds for part in range(3)]
+    assert all(door[0][0] < closed[0][0][0] for door in closed[1:]), "they close it at -x"
+    assert closed[1].mean(0)[1] < closed[2].mean(0)[1]
+    opened = thing.pose(np.array([0.3, 0.3]))
+    for part in (1, 2):
+        middle = closed[part].mean(0)
+        assert (opened[part][:3, :3] @ middle + opened[part][:3, 3])[0] < middle[0] - 0.03
 
 
 @pytest.mark.parametrize(
