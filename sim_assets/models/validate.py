@@ -278,8 +278,9 @@ def check_object(path: Path, asset: ArticulatedObject) -> None:
         raise refuse(path, "finite pivots and axes", f"{asset.pivot}, {asset.axis}")
     if np.abs(np.linalg.norm(asset.axis, axis=1) - 1).max() > 1e-9:
         raise refuse(path, "unit axes", f"{asset.axis}")
-    if not (asset.upper > 0).all():
-        raise refuse(path, "travel above zero", f"{asset.upper}")
+    least = [joint.lower for joint in asset.category.joints]
+    if not (asset.upper > least).all():
+        raise refuse(path, f"travel beyond {least}", f"{asset.upper.tolist()}")
     bounds = np.concatenate([visual.mesh.bounds for part in asset.visuals for visual in part])
     centre = (bounds.min(0) + bounds.max(0)) / 2
     if np.abs(centre).max() > 1e-6 * max(1.0, np.abs(bounds).max()):

@@ -155,7 +155,7 @@ def draw_views(
     thing = outline.thing
     drawn, turns, fills, centres = [], [], [], []
     for rng in rngs:
-        drawn.append(rng.uniform(*TRAVEL, size=(states, len(thing.upper))) * thing.upper)
+        drawn.append(draw_states(thing, rng, states))
         direction = draw_direction(thing.category.window, rng)
         turns.append(look_along(-direction, rng.uniform(-np.pi, np.pi)))
         fills.append(rng.uniform(FILL[0] + FILL_MARGIN, FILL[1] - FILL_MARGIN))
@@ -175,8 +175,7 @@ def _at_distance(
     thing = outline.thing
     drawn, turns, centres, places = [], [], [], []
     for rng in rngs:
-        size = (options.states_per_view, len(thing.upper))
-        drawn.append(rng.uniform(*TRAVEL, size=size) * thing.upper)
+        drawn.append(draw_states(thing, rng, options.states_per_view))
         gaze = -draw_direction(thing.category.window, rng)
         turns.append(look_along(gaze, rng.uniform(-np.pi, np.pi)))
         centres.append(rng.uniform(-1, 1, size=2) * min(JITTER, (1 - FULL_FRAME) / 2))
@@ -189,6 +188,15 @@ def _at_distance(
     low = np.clip(nearest, low, high)
     poses[:, :3, 3] *= ((low + np.array(places) * (high - low)) / nearest)[:, None]
     return [View(states=s, camera_T_object=p) for s, p in zip(drawn, poses, strict=True)]
+
+
+def draw_states(
+    thing: ArticulatedObject, rng: np.random.Generator, count: int
+) -> Float[np.ndarray, "{count} J"]:
+    """Joint states, uniform in TRAVEL of what lies between the category's least and the stop."""
+    lower = np.array([joint.lower for joint in thing.category.joints])
+    share = rng.uniform(*TRAVEL, size=(count, len(lower)))
+    return lower + share * (thing.upper - lower)
 
 
 def distances(thing: ArticulatedObject) -> tuple[float, float]:
@@ -346,7 +354,7 @@ def draw_state(
     """
     k = rng.uniform()
     if thetas is None:
-        return rng.uniform(*TRAVEL, size=len(thing.upper)) * thing.upper
+        return draw_states(thing, rng, 1)[0]
     if isinstance(thetas, AngleGrid):
         number = int(k * 100)
         step = thetas.test if held_out else thetas.train

@@ -77,6 +77,23 @@ def test_views_follow_the_contract(name):
     assert np.ptp(fills) > 0.3  # the range is used
 
 
+@pytest.mark.parametrize("preset", ["sim-art", "sim-art-sensor", "eap"])
+def test_no_state_is_below_the_least_of_its_category(preset: PresetName):
+    """A category of one's own may begin where its objects stand open."""
+    thing = laptop()
+    least = 0.6 * float(thing.upper[0])
+    spec = replace(thing.category.joints[0], lower=least)
+    kind = replace(thing.category, name="stand", joints=(spec,))
+    options = ViewOptions(
+        preset=preset, protocol="joint", camera=CAMERA, states_per_view=2, held_out=False
+    )
+    rngs = [generator("least", i) for i in range(40)]
+    views = draw_preset_views(Outline(replace(thing, category=kind)), rngs, options)
+    share = (np.stack([view.states for view in views]) - least) / (thing.upper - least)
+    assert TRAVEL[0] <= share.min() < 0.2
+    assert 0.9 < share.max() <= TRAVEL[1]
+
+
 def test_a_view_depends_on_its_own_generator_alone():
     outline = Outline(laptop())
     together = draw_views(outline, [generator("v", i) for i in range(9)], CAMERA)
