@@ -20,7 +20,8 @@ in glTF.
 
 Doors, lids, temples: snapped to the nearest of the root link's axes that is not vertical.
 Left of eyeglasses is the wearer's, who looks out of the front: -y. Left of a basket is that of
-somebody who looks at its front: +y.
+somebody who looks at its front: +y. So are moving parts numbered, and those of a category of one's
+own from the top down where they lie rather one on another.
 """
 
 from __future__ import annotations
@@ -159,6 +160,21 @@ def told_front(
         return ToldFront(front=snapped(-arms.mean(0), up), sure=False)
     arm = arms[0]
     return ToldFront(front=snapped(arm - axis[0] * (axis[0] @ arm), up), sure=False)
+
+
+def order(category: Category, middle: Float[np.ndarray, "J 3"]) -> list[int]:
+    """Moving parts from left to right, or from the top down where they lie rather one on another.
+
+    Parts that a symmetry exchanges lie side by side.
+
+    Args:
+        category: Of the object.
+        middle: Of each moving part at rest, object frame.
+    """
+    _, beside, above = np.ptp(middle, axis=0)
+    stacked = category.symmetry is None and above > beside
+    along = np.array([0.0, 0.0, 1.0]) if stacked else left(category)
+    return np.argsort(-(middle @ along), kind="stable").tolist()
 
 
 def left(category: Category) -> Vector:

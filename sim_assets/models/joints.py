@@ -28,7 +28,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from math import pi, radians
 
@@ -119,14 +119,14 @@ def exchanged(two: Reduction) -> Reduction:
     )
 
 
-def reordered(three: Reduction) -> Reduction:
-    """A base and two moving parts with the latter exchanged."""
-    base = three.parts[:1], three.heads[:1]
+def reordered(old: Reduction, order: Sequence[int]) -> Reduction:
+    """The moving parts in another order, that of their joints."""
+    rows = [0, *(k + 1 for k in order)]
     return Reduction(
-        joints=three.joints[::-1],
-        parts=base[0] + three.parts[:0:-1],
-        heads=base[1] + three.heads[:0:-1],
-        inverted=three.inverted[::-1],
+        joints=tuple(old.joints[k] for k in order),
+        parts=tuple(old.parts[row] for row in rows),
+        heads=tuple(old.heads[row] for row in rows),
+        inverted=tuple(old.inverted[k] for k in order),
     )
 
 
@@ -298,6 +298,7 @@ def find_rest(
         up: Unit, coordinates of the root link.
     """
     scene = _Scene(robot, surfaces, reduction, up)
+    largest = max(spec.upper for spec in category.joints)  # which is whose, their order tells
     at = [joint.clamp(0.0) for joint in reduction.joints]
     result: list[Rest] = []
     for _ in range(2 if len(at) > 1 else 1):
@@ -306,7 +307,7 @@ def find_rest(
             profile = scene.profile(category, at, j)
             low, high = limits(joint)
             at[j] = _best(profile, joint, low, high)
-            result.append(_opening(profile, at[j], low, high, category.joints[j].upper, joint))
+            result.append(_opening(profile, at[j], low, high, largest, joint))
     return tuple(result)
 
 

@@ -251,15 +251,15 @@ def _along_blades(resting: _Resting, upward: Vector, front: str | None) -> Float
 
 
 def _ordered(resting: _Resting, category: Category, rotation: Float[np.ndarray, "3 3"]) -> _Resting:
-    """Left before right; the scissors blade from which the other opens about -z."""
+    """Parts by where they are; the scissors blade from which the other opens about -z."""
     reduction, rests = resting.reduction, resting.rests
-    if len(rests) == 2:
-        middle = resting.bounds(rotation).mean(1)
-        if (middle[1] - middle[2]) @ frames.left(category) < 0:
-            return _resting(resting.model, reordered(reduction), rests[::-1])
-    elif category.name == "scissors" and (rotation @ resting.axis[0])[2] > 0:
+    if category.name == "scissors" and (rotation @ resting.axis[0])[2] > 0:
         return _resting(resting.model, exchanged(reduction), rests)
-    return resting
+    order = frames.order(category, resting.bounds(rotation)[1:].mean(1))
+    if order == sorted(order):
+        return resting
+    moved_rests = tuple(rests[k] for k in order)
+    return _resting(resting.model, reordered(reduction, order), moved_rests)
 
 
 def _object(
@@ -276,7 +276,8 @@ def _object(
         if spec.kind == "prismatic":
             bounds = np.concatenate([visual.mesh.bounds for visual in visuals[j + 1]])
             pivot[j] = (bounds.min(0) + bounds.max(0)) / 2
-            upper[j] = min(upper[j] * ratio, spec.upper)
+            upper[j] *= ratio
+        upper[j] = min(upper[j], spec.upper)
     joints = resting.reduction.joints
     at = {joint.name: rest.position for joint, rest in zip(joints, resting.rests, strict=True)}
     axis = resting.axis @ rotation.T

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import permutations
 from math import pi
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scapo.categories import Category, JointSpec, Window, category
+from scapo.categories import Category, JointKind, JointSpec, Window, category
 from sim_assets.models import frames, reader
 from sim_assets.models import joints as rest
 from sim_assets.models.joints import words
@@ -106,27 +107,33 @@ def test_drawer(axis: str, limit: str, sign: float, tmp_path: Path):
     np.testing.assert_allclose(thing.pivot[0], thing.part_mesh(1).bounds.mean(0), atol=1e-12)
 
 
-CUPBOARD = Category(
-    name="cupboard",
-    parts=("body", "left door", "right door"),
-    joints=(
-        JointSpec(kind="revolute", parent=0, child=1, lower=0.0, upper=1.9),
-        JointSpec(kind="revolute", parent=0, child=2, lower=0.0, upper=1.9),
-    ),
-    window=Window(azimuth=(-60, 60), elevation=(0, 55)),
-    diagonal=1.2,
-    words=("door",),
-)
+def furniture(kind: JointKind, word: str, *travel: float) -> Category:
+    """A category of one's own: a body with so many doors or drawers."""
+    return Category(
+        name="furniture",
+        parts=("body", *(f"{word} {j}" for j in range(len(travel)))),
+        joints=tuple(
+            JointSpec(kind=kind, parent=0, child=j + 1, lower=0.0, upper=upper)
+            for j, upper in enumerate(travel)
+        ),
+        window=Window(azimuth=(-60, 60), elevation=(0, 55)),
+        diagonal=1.2,
+        words=(word,),
+    )
 
 
+@pytest.mark.parametrize("first", [1, -1])
 @pytest.mark.parametrize("quarters", range(4))
-def test_two_doors_open_at_the_front(quarters: int, tmp_path: Path):
-    """Hinged at the outer edges, so that their middles lie beside the hinges, not before them."""
+def test_two_doors_open_at_the_front(quarters: int, first: int, tmp_path: Path):
+    """Hinged at the outer edges, so that their middles lie beside the hinges, not before them.
+
+    The left one has the first joint's travel, be it the larger or the smaller.
+    """
     turn = quarters * pi / 2
     links = {"body": box((0.4, 0.8, 0.9), (0, 0, 0))}
     joints = ""
-    for name, side in (("one", 1), ("two", -1)):
-        links[f"{name}_door"] = box((0.02, 0.4, 0.9), (-0.01, -0.2 * side, 0))
+    for name, side, height in (("one", first, 0.9), ("two", -first, 0.8)):
+        links[f"{name}_door"] = box((0.02, 0.4, height), (-0.01, -0.2 * side, 0))
         x, y = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ (
             -0.2,
             0.4 * side,
@@ -135,7 +142,8 @@ def test_two_doors_open_at_the_front(quarters: int, tmp_path: Path):
         origin = f'xyz="{x} {y} 0" rpy="0 0 {turn}"'
         joints += joint(f"{name}_hinge", ("body", f"{name}_door"), origin, "0 0 1", limit)
     links["body"].apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
-    thing = reader.read(write(tmp_path, links, joints), CUPBOARD)
+    thing = reader.read(write(tmp_path, links, joints), furniture("revolute", "door", 1.4, 0.7))
+    np.testing.assert_allclose(thing.upper, [1.4, 0.7])
     closed = [thing.part_mesh(part).bounds for part in range(3)]
     assert all(door[0][0] < closed[0][0][0] for door in closed[1:]), "they close it at -x"
     assert closed[1].mean(0)[1] < closed[2].mean(0)[1]
@@ -143,6 +151,23 @@ def test_two_doors_open_at_the_front(quarters: int, tmp_path: Path):
     for part in (1, 2):
         middle = closed[part].mean(0)
         assert (opened[part][:3, :3] @ middle + opened[part][:3, 3])[0] < middle[0] - 0.03
+
+
+@pytest.mark.parametrize("widths", list(permutations((0.5, 0.6, 0.7))))
+def test_drawers_are_numbered_from_the_top_down(widths: tuple[float, ...], tmp_path: Path):
+    """Whichever is the largest; each with the travel of its number."""
+    links, joints = {"body": box((0.5, 0.8, 1.0), (0, 0, 0))}, ""
+    for k, width in enumerate(widths):
+        links[f"drawer_{k}"] = box((0.4, width, 0.25), (-0.06, 0.01 * width, 0))
+        ends, origin = ("body", f"drawer_{k}"), f'xyz="0 0 {0.3 * (k - 1)}"'
+        joints += joint(f"slide_{k}", ends, origin, "-1 0 0", "0 0.35")
+    kind = furniture("prismatic", "drawer", 0.1, 0.2, 0.3)
+    thing = reader.read(write(tmp_path, links, joints), kind)
+    assert thing.origin.joint_names == ("slide_2", "slide_1", "slide_0")
+    np.testing.assert_allclose(thing.pivot[:, 2], [0.3, 0.0, -0.3], atol=1e-6)
+    np.testing.assert_allclose(thing.upper, [0.1, 0.2, 0.3])
+    middles = [thing.part_mesh(part).bounds.mean(0)[2] for part in (1, 2, 3)]
+    np.testing.assert_allclose(middles, [0.3, 0.0, -0.3], atol=1e-6)
 
 
 @pytest.mark.parametrize(
