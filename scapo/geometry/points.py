@@ -23,9 +23,9 @@ from scapo.geometry.numerics import at_least_float32, exact, uncompiled
 
 @torch.no_grad()
 def nearest(
-    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"]
+    source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"]
 ) -> Int[Tensor, "*B N"]:
-    """Index into `target` of the nearest neighbour of each source point.
+    """Index into `target` of the nearest neighbour of each source point, as `k_nearest` has it.
 
     Raises:
         ValueError: `target` has no points.
@@ -147,7 +147,7 @@ def gather(points: Float[Tensor, "*B M C"], index: Int[Tensor, "*B K"]) -> Float
 
 
 def squared_distances(
-    source: Float[Tensor, "*B N 3"], target: Float[Tensor, "*B M 3"]
+    source: Float[Tensor, "*B N D"], target: Float[Tensor, "*B M D"]
 ) -> Float[Tensor, "*B N"]:
     """Squared distance of each source point to its nearest target point, with gradients."""
     return (source - gather(target, nearest(source, target))).square().sum(-1)

@@ -23,7 +23,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import farthest_points, gather, k_means, k_nearest, nearest
+from scapo.geometry.points import (
+    farthest_points,
+    gather,
+    k_means,
+    k_nearest,
+    nearest,
+    squared_distances,
+)
 from scapo.geometry.rigid import joint_motion
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.skinning import deform, gaussian_weights
@@ -161,8 +168,7 @@ def misfit(
     depends on how densely the other side is sampled, and that may be more than a door that moves.
     """
     some, others = _every(clouds, asked, offset), _every(shapes, asked, offset)
-    there = (some - gather(shapes, nearest(some, shapes))).square().sum(-1)
-    back = (others - gather(clouds, nearest(others, clouds))).square().sum(-1)
+    there, back = squared_distances(some, shapes), squared_distances(others, clouds)
     return (there + 1e-6).sqrt().mean(-1) + (back + 1e-6).sqrt().mean(-1)
 
 
@@ -206,7 +212,7 @@ def residual(
     clouds: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"], template: Float[Tensor, "M 3"]
 ) -> Float[Tensor, " M"]:
     """How far each point of the template, as placed, is from the clouds: a mean over neighbours."""
-    gap = (shapes - gather(clouds, nearest(shapes, clouds))).square().sum(-1).sqrt().mean(0)
+    gap = squared_distances(shapes, clouds).sqrt().mean(0)
     return gap[k_nearest(template, template, 12)].mean(1)
 
 

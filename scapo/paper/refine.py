@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from scapo.categories import JointKind
-from scapo.geometry.points import gather, nearest, smoothed, squared_distances
+from scapo.geometry.points import gather, nearest, robust_chamfer, smoothed
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.heads import JointPairs
 from scapo.paper.objectives import Explanation
@@ -66,11 +66,8 @@ def misfit(
     points: Float[Tensor, "B N 3"], e: Explanation, kinds: tuple[JointKind, ...]
 ) -> Float[Tensor, " B"]:
     """How badly the posed template explains each cloud; a few outliers cost a bounded amount."""
-    posed = posed_template(e, kinds)
     there, back = SHARPNESS
-    seen = (1 - torch.exp(-there * squared_distances(points, posed))).mean(-1)
-    unseen = (1 - torch.exp(-back * squared_distances(posed, points))).mean(-1)
-    return seen + there / back * unseen
+    return robust_chamfer(points, posed_template(e, kinds), forward=there, backward=back)
 
 
 def moved(

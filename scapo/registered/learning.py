@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.geometry.points import Similarity, farthest_points, gather, k_nearest, nearest, normalise
+from scapo.geometry.points import Similarity, farthest_points, gather, nearest, normalise
 from scapo.geometry.rigid import rotation_angle
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.method import Step, evenly
@@ -141,7 +141,7 @@ def candidates(
     part = []
     for row in rows.unbind(1):
         placed = oriented(*template.place(take(placement, row)))
-        part.append(label[k_nearest(source, placed, 1)[..., 0]])
+        part.append(label[nearest(source, placed)])
     back = seen.frame.mT.repeat_interleave(cost.shape[1], 0)
     return Candidates(
         placement=turn_placement(placement, back),

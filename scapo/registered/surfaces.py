@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from scapo.geometry.points import Similarity, fibonacci_sphere, gather, nearest
+from scapo.geometry.points import Similarity, fibonacci_sphere, squared_distances
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.records import cat, map_tensors, take
 from scapo.registered.pairwise import within
@@ -120,8 +120,7 @@ def _shown(points: Float[Tensor, "N 3"]) -> Float[Tensor, "K 3"]:
 
 def misfit(surfaces: Float[Tensor, "B N 3"], shapes: Float[Tensor, "B M 3"]) -> Float[Tensor, " B"]:
     """Mean distance of the shapes' points to the nearest of the surfaces, and back up to `FAR`."""
-    there = (shapes - gather(surfaces, nearest(shapes, surfaces))).square().sum(-1)
-    back = (surfaces - gather(shapes, nearest(surfaces, shapes))).square().sum(-1)
+    there, back = squared_distances(shapes, surfaces), squared_distances(surfaces, shapes)
     far = FAR * torch.tanh((back + 1e-6).sqrt() / FAR)
     return (there + 1e-6).sqrt().mean(1) + far.mean(1)
 

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from scapo.geometry.points import gather, k_nearest
+from scapo.geometry.points import gather, nearest
 from scapo.registered.template import oriented
 from scapo.registered.views import PartialViews
 
@@ -60,8 +60,7 @@ def oriented_nearest(
     target_normals: Float[Tensor, "B M 3"],
 ) -> Int[Tensor, "B K"]:
     """Nearest target in position and normal: the two faces of a thin plate are told apart."""
-    source, goal = oriented(points, normals), oriented(target, target_normals)
-    return k_nearest(source, goal, 1)[..., 0]
+    return nearest(oriented(points, normals), oriented(target, target_normals))
 
 
 @torch.no_grad()

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from scapo.geometry.points import squared_distances
+from scapo.geometry.points import chamfer, squared_distances
 
 Scalar = Float[Tensor, ""]
 
@@ -22,8 +22,7 @@ def shape_distances(
 ) -> Float[Tensor, "B K"]:
     """Two-way Chamfer distance of a shape from a cloud in the frames of K hypotheses."""
     shapes = shape[:, None].expand(-1, clouds.shape[1], -1, -1)
-    there = squared_distances(clouds, shapes).mean(-1)
-    return there + squared_distances(shapes, clouds).mean(-1)
+    return chamfer(clouds, shapes)
 
 
 def slot_distances(
@@ -52,8 +51,7 @@ def whole(
     first = present.long().argmax(1)
     kept = posed[torch.arange(len(posed), device=posed.device), first][:, None, :1]
     shape = torch.where(present[..., None, None], posed, kept).flatten(1, 2)
-    there = squared_distances(points, shape).mean(-1)
-    return (there + squared_distances(shape, points).mean(-1)).mean()
+    return chamfer(points, shape).mean()
 
 
 def pivots_near_parts(

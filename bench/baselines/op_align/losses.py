@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from scapo.geometry.points import gather, k_nearest, robust_chamfer
+from scapo.geometry.points import gather, k_nearest, robust_chamfer, squared_distances
 from scapo.geometry.rigid import rotation_between
 from scapo.paper.heads import JointPairs
 
@@ -42,16 +42,10 @@ def articulated(
         canonical_weights: Of the shape.
     """
     shape = canonical[:, None].expand(-1, moved.shape[1], -1, -1)
-    there = 1 - torch.exp(-FORWARD * _squares(moved, shape))  # (B, P, N)
-    back = 1 - torch.exp(-BACKWARD * _squares(shape, moved))  # (B, P, M)
+    there = 1 - torch.exp(-FORWARD * squared_distances(moved, shape))  # (B, P, N)
+    back = 1 - torch.exp(-BACKWARD * squared_distances(shape, moved))  # (B, P, M)
     observed = (there * weights.mT).sum(1).mean()
     return observed + FORWARD / BACKWARD * (back * canonical_weights.mT).sum(1).mean()
-
-
-def _squares(source: Float[Tensor, "*B N C"], target: Float[Tensor, "*B M C"]) -> Tensor:
-    """Squared distance of each point to the nearest of the target, (*B, N)."""
-    near = k_nearest(source.detach(), target.detach(), 1)[..., 0]
-    return (source - gather(target, near)).square().sum(-1)
 
 
 def density(canonical: Float[Tensor, "B M 3"], neighbours: int) -> Scalar:
