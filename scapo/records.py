@@ -59,6 +59,18 @@ def cat(records: Sequence[T]) -> T:
     return cast("T", _combined(records, lambda tensors: torch.cat(list(tensors))))
 
 
+def either(mask: Tensor, one: T, other: T) -> T:
+    """A record with each row that of `one` where the mask (B) holds, else that of `other`.
+
+    >>> from scapo.types import Observation
+    >>> both = [Observation(points=torch.full((2, 1, 3), value)) for value in (1.0, 2.0)]
+    >>> either(torch.tensor([True, False]), *both).points[:, 0, 0]
+    tensor([1., 2.])
+    """
+    rows = torch.arange(len(mask), device=mask.device)
+    return take(cat([one, other]), torch.where(mask, rows, rows + len(mask)))
+
+
 def _combined(values: Sequence[Any], join: Callable[[Sequence[Tensor]], Tensor]) -> Any:  # noqa: ANN401
     """What stands at one place of several records, as one; other than tensors as in the first."""
     first = values[0]

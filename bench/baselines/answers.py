@@ -19,6 +19,7 @@ from scapo.categories import Category
 from scapo.geometry.part_order import joint_order, part_orders
 from scapo.geometry.rigid import apply, invert, mean_rotation, rigid
 from scapo.geometry.rotations import rotmat_to_rotvec
+from scapo.records import either
 from scapo.registered.network import procrustes
 
 ROUNDS, TRUST = 4, 0.05
@@ -107,20 +108,15 @@ def as_seen_by(
         symmetry,
     )
     gaps = [(some - first)[..., :3, :3].square().sum((1, 2, 3)) for some in (pose, other.pose)]
-    turned = gaps[1] < gaps[0]
     back = invert(other.pose[:, 0])
-
-    def either(own: Tensor, theirs: Tensor) -> Tensor:
-        return torch.where(turned.view(-1, *(1,) * (own.ndim - 1)), theirs, own)
-
-    votes, own = answer.votes, answer.pose
-    return Answer(
-        part=either(answer.part, answer.part[..., order]),
-        votes=None if votes is None else either(votes, votes[:, :, order] @ symmetry),
-        pose=None if own is None else either(own, other.pose),
-        pivot=either(answer.pivot, apply(back, other.pivot)),
-        axis=either(answer.axis, other.axis @ back[:, :3, :3].mT),
+    turned = Answer(
+        part=answer.part[..., order],
+        votes=None if answer.votes is None else answer.votes[:, :, order] @ symmetry,
+        pose=None if answer.pose is None else other.pose,
+        pivot=apply(back, other.pivot),
+        axis=other.axis @ back[:, :3, :3].mT,
     )
+    return either(gaps[1] < gaps[0], turned, answer)
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ Lengths are in units of four times the mean radius of the cloud.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 import torch
@@ -39,6 +39,7 @@ from scapo.method import (
     changes,
 )
 from scapo.ranges import Positive, Share
+from scapo.records import either
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
 FEWEST = 8
@@ -327,11 +328,7 @@ class NpcsEpn(AbstractMethod):
         )
         said = first.part.argmax(-1)
         alike = [(one.part.argmax(-1) == said).sum(1) for one in (look, other)]
-        swap = alike[1] > alike[0]
-        names = [one.name for one in fields(Answer)]
-        pairs = [(getattr(look, name), getattr(other, name)) for name in names]
-        chosen = [torch.where(swap.view(-1, *(1,) * (a.ndim - 1)), b, a) for a, b in pairs]
-        return Answer(**dict(zip(names, chosen, strict=True)))
+        return either(alike[1] > alike[0], other, look)
 
     def _pose(self, points: Float[Tensor, "B N 3"], answer: Answer, p: int) -> Similarities:
         """Of one part, in the cloud, from the points that are most likely its own."""

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from scapo.geometry.points import gather
 from scapo.geometry.rigid import project_rotation
+from scapo.records import cat
 
 SAMPLE = 3
 """Matches that fix a similarity."""
@@ -74,12 +75,7 @@ def ransac(
         draws: Of three members each.
     """
     chunks = zip(target.split(CHUNK), source.split(CHUNK), member.split(CHUNK), strict=True)
-    found = [_ransac(a, b, counts, threshold, draws) for a, b, counts in chunks]
-    return Similarities(
-        scale=torch.cat([one.scale for one in found]),
-        rotation=torch.cat([one.rotation for one in found]),
-        shift=torch.cat([one.shift for one in found]),
-    )
+    return cat([_ransac(a, b, counts, threshold, draws) for a, b, counts in chunks])
 
 
 def _ransac(

@@ -219,15 +219,7 @@ def _with_precision(cell: Cell, passed: int, count: int) -> Cell:
     value = 100 * passed / count
     if cell.value is None or abs(cell.value - value) > 1e-9:
         raise ArithmeticError(f"average precision: expected k/n = {value}, found {cell.value}")
-    return Cell(
-        value=value,
-        decimals=cell.decimals,
-        low=cell.low,
-        high=cell.high,
-        deviation=cell.deviation,
-        count=count,
-        passed=passed,
-    )
+    return replace(cell, value=value, count=count, passed=passed, undefined=0)
 
 
 def _sampled(runs: Sequence[Scores], tables: list[np.ndarray], decimals: int, seed: int) -> Sampled:

@@ -24,6 +24,7 @@ from scapo.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from scapo.method import NO_JOURNAL, Journal
 from scapo.paper.heads import JointNetwork, JointPairs, KeypointNetwork, ResidualNetwork
 from scapo.paper.part_search import Placements, Skeleton
+from scapo.records import take
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,19 +37,6 @@ class FirstTargets:
     residual: Float[Tensor, "B M 3"]
     keypoints: Float[Tensor, "B P 3"]
     """Aligned frame."""
-
-    def rows(self, index: Tensor) -> FirstTargets:
-        """Those of some clouds."""
-        return FirstTargets(
-            joints=_rows(self.joints, index),
-            template_joints=_rows(self.template_joints, index),
-            residual=self.residual[index],
-            keypoints=self.keypoints[index],
-        )
-
-
-def _rows(joints: JointPairs, index: Tensor) -> JointPairs:
-    return JointPairs(pivot=joints.pivot[index], axis=joints.axis[index], state=joints.state[index])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,7 +159,7 @@ def fit_networks(
             journal.tell("networks fitted to it", k / steps, left)
         index = torch.randint(count, (32,), generator=generator, device=generator.device)
         order = torch.randperm(number, generator=generator, device=generator.device)
-        want = wanted.rows(index)
+        want = take(wanted, index)
         change = residual(inputs.features[index])
         own, its = joints.pair(inputs.aligned[index][:, order], inputs.template + change.detach())
         loss = (

@@ -34,6 +34,7 @@ from scapo.geometry.points import (
 from scapo.geometry.rigid import joint_motion
 from scapo.geometry.rotations import rotvec_to_rotmat
 from scapo.paper.skinning import deform, gaussian_weights
+from scapo.records import cat, map_tensors, take
 
 Kinds = tuple[JointKind, ...]
 T = TypeVar("T", "Skeleton", "Placements")
@@ -345,7 +346,7 @@ class PartSearch:
         some = clouds[unlikeness(clouds, still, c.asked // 2).argsort()[: c.alike * c.clouds[-1]]]
         _, at = self.descend(some, whole, motionless(some, joints), c.placing, "rigid")
         order = unlikeness(some, posed(whole, at, self.kinds), c.asked).argsort()[: c.clouds[-1]]
-        return some[order], having(at, [value[order] for value in values(at)])
+        return some[order], take(at, order)
 
     def starts(
         self, points: Float[Tensor, "M 3"], clouds: Float[Tensor, "B N 3"], at: Placements
@@ -403,7 +404,7 @@ class PartSearch:
             optimizer.zero_grad()
             cost.backward()
             optimizer.step()
-        return having(s, [x.detach() for x in common]), having(at, [x.detach() for x in own])
+        return map_tensors((having(s, common), having(at, own)), Tensor.detach)
 
     @torch.no_grad()
     def with_best_states(
@@ -434,11 +435,9 @@ class PartSearch:
         """How the skeleton lies in each cloud, and the misfit that is left."""
         found, left = [], []
         for rows in torch.arange(len(clouds), device=clouds.device).split(64):
-            begin = having(at, [value[rows] for value in values(at)])
-            _, end = self.descend(clouds[rows], s, begin, steps)
+            _, end = self.descend(clouds[rows], s, take(at, rows), steps)
             with torch.no_grad():
                 shapes = posed(s, end, self.kinds)
                 left.append(misfit(clouds[rows], shapes, 2 * self.config.asked))
-            found.append(values(end))
-        every = [torch.cat(column) for column in zip(*found, strict=True)]
-        return having(at, every), torch.cat(left)
+            found.append(end)
+        return cat(found), torch.cat(left)

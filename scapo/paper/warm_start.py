@@ -29,7 +29,7 @@ from scapo.paper.autoencoder import Encoding
 from scapo.paper.first_targets import Lying
 from scapo.paper.objectives import LossConfig
 from scapo.paper.part_search import Kinds, Skeleton, matched, split_skeleton
-from scapo.records import cat, map_tensors, take
+from scapo.records import cat, either, map_tensors, take
 from scapo.types import Observation
 
 POINTS = 1024
@@ -104,8 +104,7 @@ class Told:
     def nearer(self, other: Told, encoding: Encoding) -> Told:
         """Of two readings of each cloud the one whose frame is nearer to the encoder's."""
         gap = [frame_errors(encoding, told) for told in (self, other)]
-        chosen = (gap[1] < gap[0]).long() * len(gap[0])
-        return take(cat([self, other]), chosen + torch.arange(len(gap[0])).to(chosen))
+        return either(gap[1] < gap[0], other, self)
 
     def turned(self, pose: Float[Tensor, "B 4 4"]) -> Told:
         """Of the same clouds moved by a pose."""

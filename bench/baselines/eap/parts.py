@@ -8,7 +8,7 @@ is moved by its joint about pivot and axis there and then turned by the anchor.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import torch
@@ -92,13 +92,10 @@ class Kinematics:
     def only(self, anchor: Int[Tensor, " B"]) -> Kinematics:
         """The hypothesis of one anchor for each cloud, K = 1."""
         rows = torch.arange(len(anchor), device=anchor.device)
-        return Kinematics(
-            shapes=self.shapes,
-            pivots=self.pivots,
+        return replace(
+            self,
             axis=self.axis[rows, anchor][:, None],
             states=self.states[rows, :, anchor][..., None],
-            base=self.base,
-            kind=self.kind,
         )
 
 

@@ -38,7 +38,7 @@ from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, random_rotations, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, StepDecay, changes
-from scapo.paper.heads import JointPairs, thin
+from scapo.paper.heads import thin
 from scapo.paper.losses import labelled, shape_variance, state_gauge
 from scapo.paper.skinning import cross_maps, part_maps
 from scapo.pictures import Panel, PictureData
@@ -478,12 +478,8 @@ def opalign_record(e: Alignment) -> dict[str, Tensor]:
 
 def _disturbed(one: Articulation, noise: Float[Tensor, "B J 3"]) -> Articulation:
     """The same with noise on its axes."""
-    joints = one.joints
-    axis = F.normalize(joints.axis + noise, dim=-1)
-    return Articulation(
-        weights=one.weights,
-        joints=JointPairs(pivot=joints.pivot, axis=axis, state=joints.state),
-    )
+    axis = F.normalize(one.joints.axis + noise, dim=-1)
+    return replace(one, joints=replace(one.joints, axis=axis))
 
 
 def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
