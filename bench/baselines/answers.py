@@ -12,15 +12,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import Category
 from scapo.geometry.part_order import joint_order, part_orders
-from scapo.geometry.rigid import apply, invert, mean_rotation, rigid
+from scapo.geometry.points import Similarity, gather
+from scapo.geometry.rigid import apply, invert, mean_rotation, random_rotations, rigid
 from scapo.geometry.rotations import rotmat_to_rotvec
 from scapo.records import either
 from scapo.registered.network import procrustes
+from scapo.types import Labels
 
 ROUNDS, TRUST = 4, 0.05
 """Repetitions of the Procrustes step, each with votes weighed by 1 / (1 + (off / TRUST)^2)."""
@@ -52,6 +55,64 @@ class Target:
     pivot: Float[Tensor, "B J 3"]
     axis: Float[Tensor, "B J 3"]
     """Unit vectors."""
+
+    @staticmethod
+    def of(labels: Labels, similarity: Similarity, who: str, size: float = 1.0) -> Target:
+        """The labels of clouds that were normalised and then made `size` times as large.
+
+        Args:
+            labels: Camera frame, metres.
+            similarity: The normalisation.
+            who: Name of the method, for the message.
+            size: By which lengths are multiplied after it.
+
+        Raises:
+            ValueError: Some are withheld.
+        """
+        if labels.part is None or labels.camera_T_part is None or labels.joints is None:
+            raise ValueError(f"{who}: expected parts, poses and joints, found some withheld")
+        pose = labels.camera_T_part.clone()
+        pose[..., :3, 3] = size * similarity.forward(pose[..., :3, 3])
+        return Target(
+            part=labels.part.long(),
+            pose=pose,
+            pivot=size * similarity.forward(labels.joints.pivot),
+            axis=F.normalize(labels.joints.axis, dim=-1),
+        )
+
+
+def turned_at_random(
+    points: Float[Tensor, "B N 3"],
+    target: Target,
+    count: int | None,
+    share: float,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "B K 3"], Target]:
+    """Some of the points of each cloud, and some clouds turned with their truth.
+
+    Args:
+        points: Of the clouds.
+        target: Theirs.
+        count: Of points; None: all, as where there are no more.
+        share: Of the clouds that are turned.
+        generator: On the device of the clouds.
+    """
+    batch, number, _ = points.shape
+    draw = {"generator": generator, "device": points.device}
+    part = target.part
+    if count is not None and count < number:
+        chosen = torch.rand(batch, number, **draw).topk(count, dim=1).indices
+        points, part = gather(points, chosen), part.gather(1, chosen)
+    turned = torch.rand(batch, 1, 1, **draw) < share
+    rotation = random_rotations(batch, generator, dtype=points.dtype)
+    rotation = torch.where(turned, rotation, torch.eye(3).to(points))
+    pose = rigid(rotation, rotation.new_zeros(batch, 3))
+    return apply(pose, points), Target(
+        part=part,
+        pose=pose[:, None] @ target.pose,
+        pivot=apply(pose, target.pivot),
+        axis=target.axis @ rotation.mT,
+    )
 
 
 def exchange(parts: int) -> tuple[list[int], list[int], float]:

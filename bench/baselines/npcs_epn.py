@@ -22,13 +22,13 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bench.baselines.answers import Target, exchange, exchanged, states
+from bench.baselines.answers import Target, exchange, exchanged, states, turned_at_random
 from bench.baselines.npcs_network import Answer, NetworkConfig, NpcsNetwork
 from bench.baselines.similarity_ransac import Similarities, ransac
 from scapo.categories import Category
 from scapo.first_weights import initialise
-from scapo.geometry.points import Similarity, gather, normalise
-from scapo.geometry.rigid import apply, invert, point_line_distance, random_rotations, rigid
+from scapo.geometry.points import normalise
+from scapo.geometry.rigid import apply, invert, point_line_distance, rigid
 from scapo.method import (
     AbstractMethod,
     HalfCosine,
@@ -38,6 +38,7 @@ from scapo.method import (
     StepDecay,
     changes,
 )
+from scapo.paper.losses import least_costly
 from scapo.ranges import Positive, Share
 from scapo.records import either
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
@@ -186,7 +187,7 @@ class NpcsEpn(AbstractMethod):
             ValueError: Labels are withheld.
         """
         del stage, generator
-        points, target, _ = self._normalised(observation, labels)
+        points, target = self._normalised(observation, labels)
         for p in range(len(self.box_size)):
             some = [
                 apply(invert(one.pose[:, p]), points)[one.part == p]
@@ -206,19 +207,9 @@ class NpcsEpn(AbstractMethod):
 
     def _normalised(
         self, observation: Observation, labels: Labels
-    ) -> tuple[Float[Tensor, "B N 3"], Target, Similarity]:
-        if labels.part is None or labels.camera_T_part is None or labels.joints is None:
-            raise ValueError(f"{self.name}: expected parts, poses and joints, found some withheld")
+    ) -> tuple[Float[Tensor, "B N 3"], Target]:
         points, similarity = normalise(observation.points)
-        pose = labels.camera_T_part.clone()
-        pose[..., :3, 3] = similarity.forward(pose[..., :3, 3])
-        target = Target(
-            part=labels.part.long(),
-            pose=pose,
-            pivot=similarity.forward(labels.joints.pivot),
-            axis=F.normalize(labels.joints.axis, dim=-1),
-        )
-        return points, target, similarity
+        return points, Target.of(labels, similarity, self.name)
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """Weighted terms, each cloud against the reading of its labels that costs it least.
@@ -226,17 +217,15 @@ class NpcsEpn(AbstractMethod):
         Raises:
             ValueError: Labels are withheld.
         """
-        points, target, _ = self._normalised(observation, labels)
+        points, target = self._normalised(observation, labels)
         if self.training:
-            points, target = augmented(points, target, self.config, step.generator)
+            config = self.config
+            points, target = turned_at_random(
+                points, target, config.points, config.rotated, step.generator
+            )
         answer = self.network(points, points)
         found = [self._penalties(points, answer, one) for one in self._readings(target)]
-        totals = torch.stack([torch.stack(list(terms.values())).sum(0) for terms in found])
-        chosen = totals.argmin(0, keepdim=True)  # (1, B)
-        return {
-            name: torch.stack([terms[name] for terms in found]).gather(0, chosen).mean()
-            for name in found[0]
-        }
+        return least_costly(found)
 
     def _penalties(
         self, points: Float[Tensor, "B N 3"], answer: Answer, target: Target
@@ -430,29 +419,3 @@ def belonging(logits: Float[Tensor, "B N K"], which: int) -> Bool[Tensor, "B N"]
 def median(x: Float[Tensor, "B N 3"], counts: Bool[Tensor, "B N"]) -> Float[Tensor, "B 3"]:
     """Of each coordinate over the points that count."""
     return torch.where(counts[..., None], x, torch.nan).nanmedian(1).values
-
-
-def augmented(
-    points: Float[Tensor, "B N 3"],
-    target: Target,
-    config: NpcsEpnConfig,
-    generator: torch.Generator,
-) -> tuple[Float[Tensor, "B K 3"], Target]:
-    """Some of the points, and some clouds turned with their truth."""
-    batch, number, _ = points.shape
-    device = points.device
-    part = target.part
-    if config.points < number:
-        order = torch.rand(batch, number, generator=generator, device=device)
-        chosen = order.topk(config.points, dim=1).indices
-        points, part = gather(points, chosen), part.gather(1, chosen)
-    turned = torch.rand(batch, 1, 1, generator=generator, device=device) < config.rotated
-    rotation = random_rotations(batch, generator, dtype=points.dtype)
-    rotation = torch.where(turned, rotation, torch.eye(3).to(points))
-    pose = rigid(rotation, rotation.new_zeros(batch, 3))
-    return apply(pose, points), Target(
-        part=part,
-        pose=pose[:, None] @ target.pose,
-        pivot=apply(pose, target.pivot),
-        axis=target.axis @ rotation.mT,
-    )

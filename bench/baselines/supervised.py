@@ -32,14 +32,16 @@ from bench.baselines.answers import (
     mean_pose,
     poses_of,
     states,
+    turned_at_random,
 )
 from bench.baselines.body import Block, Body, Features
 from scapo.categories import Category
 from scapo.first_weights import initialise
 from scapo.geometry.numerics import at_least_float32
-from scapo.geometry.points import MEAN_RADIUS, gather, normalise
-from scapo.geometry.rigid import apply, invert, random_rotations, rigid
+from scapo.geometry.points import MEAN_RADIUS, normalise
+from scapo.geometry.rigid import apply, invert, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, changes
+from scapo.paper.losses import least_costly
 from scapo.ranges import Share
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
 
@@ -195,22 +197,6 @@ def _smooth(found: Float[Tensor, "B K 3"], true: Float[Tensor, "B K 3"]) -> Floa
     return F.smooth_l1_loss(found, true, beta=BEND, reduction="none").sum(-1).mean(1)
 
 
-def best_order(
-    points: Float[Tensor, "B N 3"],
-    answer: Answer,
-    targets: list[Target],
-    config: LearningConfig,
-) -> dict[str, Tensor]:
-    """Means of the terms, each cloud against the target that costs it least in all."""
-    found = [penalties(points, answer, target, config) for target in targets]
-    totals = torch.stack([torch.stack(list(terms.values())).sum(0) for terms in found])
-    chosen = totals.argmin(0, keepdim=True)  # (1, B)
-    return {
-        name: torch.stack([terms[name] for terms in found]).gather(0, chosen).mean()
-        for name in found[0]
-    }
-
-
 class SupervisedMethod(AbstractMethod, ABC):
     """A body, the heads and their training; a baseline says which body."""
 
@@ -324,23 +310,14 @@ class SupervisedMethod(AbstractMethod, ABC):
         targets = [target]
         if self.either_order:
             targets.append(exchanged(target, points.new_tensor(self.category.symmetry)))
-        return best_order(points, answer, targets, self.learning)
+        return least_costly([penalties(points, answer, one, self.learning) for one in targets])
 
     def _normalised(
         self, observation: Observation, labels: Labels
     ) -> tuple[Float[Tensor, "B N 3"], Target]:
         """Clouds of mean radius 0.5, and the labels in their frame."""
-        if labels.part is None or labels.camera_T_part is None or labels.joints is None:
-            raise ValueError(f"{self.name}: expected parts, poses and joints, found some withheld")
         points, similarity = normalise(observation.points)
-        pose = labels.camera_T_part.clone()
-        pose[..., :3, 3] = GROW * similarity.forward(pose[..., :3, 3])
-        return GROW * points, Target(
-            part=labels.part.long(),
-            pose=pose,
-            pivot=GROW * similarity.forward(labels.joints.pivot),
-            axis=F.normalize(labels.joints.axis, dim=-1),
-        )
+        return GROW * points, Target.of(labels, similarity, self.name, GROW)
 
     @torch.no_grad()
     def predict(self, observation: Observation, mode: Mode = "fast") -> Prediction:
@@ -374,22 +351,8 @@ def augmented(
     generator: torch.Generator,
 ) -> tuple[Float[Tensor, "B K 3"], Target]:
     """Some of the points, some clouds turned with their truth and some disturbed."""
-    batch, number, _ = points.shape
+    points, target = turned_at_random(points, target, config.points, config.rotated, generator)
     draw = {"generator": generator, "device": points.device}
-    part = target.part
-    if config.points is not None and config.points < number:
-        chosen = torch.rand(batch, number, **draw).topk(config.points, dim=1).indices
-        points, part = gather(points, chosen), part.gather(1, chosen)
-    turned = torch.rand(batch, 1, 1, **draw) < config.rotated
-    rotation = random_rotations(batch, generator, dtype=points.dtype)
-    rotation = torch.where(turned, rotation, torch.eye(3).to(points))
-    disturbed = torch.rand(batch, 1, 1, **draw) < config.noisy
+    disturbed = torch.rand(len(points), 1, 1, **draw) < config.noisy
     noise = config.noise * torch.randn(points.shape, dtype=points.dtype, **draw)
-    pose = rigid(rotation, rotation.new_zeros(batch, 3))
-    return apply(pose, points) + noise * disturbed, replace(
-        target,
-        part=part,
-        pose=pose[:, None] @ target.pose,
-        pivot=apply(pose, target.pivot),
-        axis=target.axis @ rotation.mT,
-    )
+    return points + noise * disturbed, target

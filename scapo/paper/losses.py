@@ -8,6 +8,7 @@ reasons). All return a scalar mean over the batch; lengths are in normalised uni
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -262,11 +263,23 @@ def labelled(
             pivot, axis = labels.joints.pivot[:, joint], labels.joints.axis[:, joint]
             terms["labelled_joints"] = scales[1] * _joint_error(*joints, pivot, axis)
         found.append(terms)
-    every = {name: torch.stack([terms[name] for terms in found]) for name in found[0]}
-    if not every:
+    return least_costly(found)
+
+
+def least_costly(readings: Sequence[Mapping[str, Float[Tensor, " B"]]]) -> dict[str, Scalar]:
+    """Means of the terms, each cloud by the reading of its labels that costs it least in all.
+
+    Args:
+        readings: Terms of each cloud, by every order of the parts that is right.
+    """
+    if not readings[0]:
         return {}
-    best = torch.stack(tuple(every.values())).sum(0).argmin(0, keepdim=True)
-    return {name: error.gather(0, best).mean() for name, error in every.items()}
+    totals = torch.stack([torch.stack(list(terms.values())).sum(0) for terms in readings])
+    best = totals.argmin(0, keepdim=True)  # (1, B)
+    return {
+        name: torch.stack([terms[name] for terms in readings]).gather(0, best).mean()
+        for name in readings[0]
+    }
 
 
 def _entropy(weights: Float[Tensor, "B N P"], part: Int[Tensor, "B N"]) -> Float[Tensor, " B"]:

@@ -14,7 +14,6 @@ from bench.baselines.answers import Target, exchanged
 from bench.baselines.npcs_epn import (
     NpcsEpn,
     NpcsEpnConfig,
-    augmented,
     belonging,
     cpu_config,
     median,
@@ -23,7 +22,7 @@ from bench.baselines.npcs_epn import (
 from bench.metrics import sample_errors
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron
-from scapo.geometry.rigid import apply, point_line_distance
+from scapo.geometry.rigid import point_line_distance
 from scapo.method import HalfCosine, Step, StepDecay
 from scapo.types import Labels, Observation
 from tests.helpers.hinged import plates
@@ -214,7 +213,7 @@ def test_the_truth_costs_nothing_in_either_order() -> None:
     observation, labels = plates(3, 200, seed=5)
     method = made().eval()
     method.start("learn", observation, labels, generator(0))
-    points, target, _ = method._normalised(observation, labels)
+    points, target = method._normalised(observation, labels)
     assert labels.part is not None
     assert LAPTOP.symmetry is not None
     other = exchanged(target, torch.tensor(LAPTOP.symmetry).float())
@@ -233,7 +232,7 @@ def test_looks_in_another_order_are_brought_to_the_first() -> None:
     observation, labels = plates(3, 200, seed=5)
     method = made().eval()
     method.start("learn", observation, labels, generator(0))
-    points, target, _ = method._normalised(observation, labels)
+    points, target = method._normalised(observation, labels)
     other = exchanged(target, torch.tensor(LAPTOP.symmetry).float())
     here, there = (perfect(method, points, one) for one in (target, other))
     for first, look in ((here, there), (there, here), (here, here)):
@@ -248,7 +247,7 @@ def test_a_prediction_is_the_mean_of_its_looks(monkeypatch: pytest.MonkeyPatch) 
     observation, labels = plates(2, 200, seed=5)
     method = made(replace(TINY, points=32)).eval()  # seven clouds, of which four are asked
     method.start("learn", observation, labels, generator(0))
-    points, target, _ = method._normalised(observation, labels)
+    points, target = method._normalised(observation, labels)
     truth, seen = perfect(method, points, target), []
 
     def look(some: Tensor, asked: Tensor):
@@ -271,7 +270,7 @@ def test_true_answers_become_true_poses_and_joints() -> None:
     observation, labels = plates(3, 200, seed=5)
     method = made().eval()
     method.start("learn", observation, labels, generator(0))
-    points, target, _ = method._normalised(observation, labels)
+    points, target = method._normalised(observation, labels)
     answer = perfect(method, points, target)
     for p in range(2):
         pose = method._pose(points, answer, p)
@@ -324,22 +323,6 @@ def test_medians_leave_out_what_does_not_count() -> None:
     counts = torch.tensor([[True] * 5 + [False] * 4, [False] * 8 + [True]])
     assert_close(median(x, counts)[0], x[0, :5].median(0).values)
     assert_close(median(x, counts)[1], x[1, 8])
-
-
-def test_augmentation_moves_the_truth_along() -> None:
-    observation, labels = plates(4, 60)
-    method = made(replace(TINY, points=30, rotated=1.0))
-    points, target, _ = method._normalised(observation, labels)
-    moved, new = augmented(points, target, method.config, generator(2))
-    assert moved.shape == (4, 30, 3)
-    for b in range(4):
-        back = apply(target.pose[b, 0] @ new.pose[b, 0].inverse(), moved[b])
-        apart = (back[:, None] - points[b]).norm(dim=-1)
-        assert apart.amin(1).max() < 1e-4
-        assert torch.equal(target.part[b][apart.argmin(1)], new.part[b])
-    turned = new.pose[..., :3, :3] @ target.pose[..., :3, :3].mT
-    assert_close((turned[:, 0] @ target.axis.mT).mT, new.axis, atol=1e-5, rtol=0)
-    assert (turned - torch.eye(3)).abs().amax((1, 2, 3)).min() > 0.1
 
 
 def test_presets_and_variants() -> None:
