@@ -39,7 +39,7 @@ from scapo.categories import Category
 from scapo.first_weights import initialise
 from scapo.geometry.numerics import at_least_float32
 from scapo.geometry.points import MEAN_RADIUS, normalise
-from scapo.geometry.rigid import apply, invert, rigid
+from scapo.geometry.rigid import apply, gram_schmidt, invert, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, changes
 from scapo.paper.losses import least_costly
 from scapo.ranges import Share
@@ -152,13 +152,6 @@ class Heads(nn.Module):
 
 def _two_layers(inputs: int, width: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, outputs))
-
-
-def gram_schmidt(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
-    """The rotation whose first column is along a and whose second lies in the plane of a and b."""
-    first = F.normalize(a, dim=-1)
-    second = F.normalize(b - (first * b).sum(-1, keepdim=True) * first, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
 
 
 def penalties(

@@ -141,6 +141,16 @@ def project_rotation(matrix: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]
     return special_procrustes(matrix)
 
 
+def gram_schmidt(
+    first: Float[Tensor, "*B 3"], second: Float[Tensor, "*B 3"]
+) -> Float[Tensor, "*B 3 3"]:
+    """The rotation whose first column is along one vector, the second in the plane of both."""
+    first = torch.nn.functional.normalize(first, dim=-1)
+    second = second - (first * second).sum(-1, keepdim=True) * first
+    second = torch.nn.functional.normalize(second, dim=-1)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+
+
 def mean_rotation(rotations: Float[Tensor, "*B K 3 3"]) -> Float[Tensor, "*B 3 3"]:
     """Chordal mean: the projection of the sum over K."""
     return project_rotation(rotations.sum(-3))

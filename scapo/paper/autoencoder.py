@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from scapo.geometry.numerics import exact
 from scapo.geometry.points import chamfer, gather
-from scapo.geometry.rigid import project_rotation, rotation_angle
+from scapo.geometry.rigid import gram_schmidt, project_rotation, rotation_angle
 from scapo.paper.vector_neurons import (
     TINY,
     EdgeForm,
@@ -151,15 +151,9 @@ def mean_encoding(looks: Sequence[Encoding]) -> Encoding:
 def project(frame: Float[Tensor, "*B 3 3"], config: EncoderConfig) -> Float[Tensor, "*B 3 3"]:
     """The rotation that is used wherever one is needed; `frame` itself feeds L_ortho alone."""
     with exact(frame.device.type):
-        return project_rotation(frame) if config.projection == "svd" else gram_schmidt(frame)
-
-
-def gram_schmidt(frame: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
-    """Rotation from the first two columns, det +1."""
-    first = F.normalize(frame[..., 0], dim=-1)
-    second = frame[..., 1] - (first * frame[..., 1]).sum(-1, keepdim=True) * first
-    second = F.normalize(second, dim=-1)
-    return torch.stack([first, second, torch.linalg.cross(first, second)], -1)
+        if config.projection == "svd":
+            return project_rotation(frame)
+        return gram_schmidt(frame[..., 0], frame[..., 1])
 
 
 class Encoder(nn.Module):

@@ -6,7 +6,7 @@ Frames: `aligned` is the paper's S_obj, `template` its Y_X. Lengths are in norma
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -36,6 +36,51 @@ class JointPairs:
     def relative(self) -> Float[Tensor, "B J"]:
         """Child minus parent."""
         return self.state[..., 1] - self.state[..., 0]
+
+
+def opalign_record(
+    rotation: Float[Tensor, "B 3 3"],
+    translation: Float[Tensor, "B 3"],
+    aligned: JointPairs,
+    canonical: JointPairs,
+) -> dict[str, Tensor]:
+    """What OP-Align's released evaluator asks of a network, under its names.
+
+    Args:
+        rotation: input_R_aligned.
+        translation: Aligned points are R^T x - t.
+        aligned: Joints of the aligned shape (S).
+        canonical: Joints of the canonical shape or template (I).
+    """
+    record = {"R_select": rotation, "T_select": translation}
+    for letter, joints in (("S", aligned), ("I", canonical)):
+        record |= {
+            f"{letter}_joint": joints.pivot,
+            f"{letter}_drct": joints.axis,
+            f"{letter}_angl": joints.state,
+        }
+    return record
+
+
+def joint_pairs(
+    numbers: Float[Tensor, "B J 8"],
+    kinds: tuple[JointKind, ...],
+    revolute: float,
+    prismatic: float,
+) -> JointPairs:
+    """The joints that a network says: pivot, axis, and states within half their range of 0.
+
+    Args:
+        numbers: Of each joint.
+        kinds: Of the joints.
+        revolute: Width of the range of states of hinges, rad.
+        prismatic: The same of joints that slide, normalised units.
+    """
+    pivot, axis, state = numbers.split((3, 3, 2), -1)
+    reach = {"revolute": revolute, "prismatic": prismatic}
+    scale = state.new_tensor([reach[kind] for kind in kinds])[:, None]
+    state = scale * (torch.sigmoid(state) - 0.5)  # (B, J, 2)
+    return JointPairs(pivot=pivot, axis=F.normalize(axis, dim=-1), state=state)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,17 +171,12 @@ class JointNetwork(nn.Module):
             x = block(x)
             x = torch.cat([x, x.amax(1, keepdim=True).expand_as(x)], -1)
         pooled = self.blocks[-1](x).amax(1)
-        pivot, axis, state = (
-            at_least_float32(self.head(pooled))
-            .unflatten(1, (len(self.kinds), 8))
-            .split((3, 3, 2), -1)
-        )
-        reach = {"revolute": self.config.revolute_range, "prismatic": self.config.prismatic_range}
-        scale = state.new_tensor([reach[kind] for kind in self.kinds])[:, None]
-        state = scale * (torch.sigmoid(state) - 0.5)  # (B, J, 2)
-        if self.config.base_fixed:
-            state = state * state.new_tensor([0.0, 1.0])
-        return JointPairs(pivot=pivot, axis=F.normalize(axis, dim=-1), state=state)
+        numbers = at_least_float32(self.head(pooled)).unflatten(1, (len(self.kinds), 8))
+        config = self.config
+        joints = joint_pairs(numbers, self.kinds, config.revolute_range, config.prismatic_range)
+        if not config.base_fixed:
+            return joints
+        return replace(joints, state=joints.state * numbers.new_tensor([0.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -38,6 +38,7 @@ from scapo.paper.heads import (
     KeypointNetwork,
     ResidualNetwork,
     Template,
+    opalign_record,
     part_centroids,
     thin,
 )
@@ -50,24 +51,6 @@ from scapo.pictures import PictureData
 from scapo.records import cat, map_tensors, take
 from scapo.registered.method import load_run
 from scapo.types import Joints, Labels, Observation, Prediction
-
-
-def opalign_record(e: Explanation) -> dict[str, Tensor]:
-    """What OP-Align's released evaluator asks of a network, under its names.
-
-    Aligned points are R_select^T x - T_select there; S is the aligned shape, I the template.
-    """
-    encoding = e.encoding
-    turned = (encoding.rotation.mT @ encoding.translation[..., None])[..., 0]
-    record = {"R_select": encoding.rotation, "T_select": turned}
-    for letter, joints in (("S", e.joints), ("I", e.template_joints)):
-        record |= {
-            f"{letter}_joint": joints.pivot,
-            f"{letter}_drct": joints.axis,
-            f"{letter}_angl": joints.state,
-        }
-    return record
-
 
 UNNAMED = frozenset(
     {"preset", "supervision", "loss.without", "lr", "min_lr", "weight_decay", "start"}
@@ -405,6 +388,7 @@ class Scapo(AbstractMethod):
         state = joints.relative() - explanation.template_joints.relative()
         slide = torch.tensor([kind == "prismatic" for kind in self.kinds], device=state.device)
         scale, weights = similarity.scale[:, None], explanation.weights
+        shift = (encoding.rotation.mT @ encoding.translation[..., None])[..., 0]
         if self.config.labels_of == "told":
             weights = smoothed_template_weights(points, explanation, self.kinds)
         elif self.config.labels_of == "template":
@@ -419,5 +403,5 @@ class Scapo(AbstractMethod):
             ),
             canonical_points=explanation.template / scale[..., None],
             canonical_part=explanation.template_weights.argmax(-1),
-            record=opalign_record(explanation),
+            record=opalign_record(encoding.rotation, shift, joints, explanation.template_joints),
         )

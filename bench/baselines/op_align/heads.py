@@ -21,7 +21,7 @@ from scapo.equivariant.layers import ChannelNorm
 from scapo.first_weights import uniform
 from scapo.geometry.numerics import at_least_float32, exact
 from scapo.geometry.rotations import rotvec_to_rotmat
-from scapo.paper.heads import MOST_BLOCKS, JointPairs, ResidualBlock, ZeroLinear
+from scapo.paper.heads import MOST_BLOCKS, JointPairs, ResidualBlock, ZeroLinear, joint_pairs
 
 
 def layers(*sizes: int, slope: float = 0.0) -> list[nn.Module]:
@@ -224,23 +224,13 @@ class PointNetwork(nn.Module):
                 ]
                 x = torch.cat([x, torch.cat(spread)], -1)
         weights = torch.softmax(at_least_float32(self.segmentation(x)), -1)
-        joints = self._joints(torch.cat(pooled(x))).chunk(2)
+        ranges = self.config.revolute_range, self.config.prismatic_range
+        numbers = at_least_float32(self.joint(torch.cat(pooled(x))))
+        joints = numbers.unflatten(1, (len(self.kinds), 8)).chunk(2)
         one, other = (
-            Articulation(weights=weight.unflatten(0, size), joints=self._read(joint))
+            Articulation(
+                weights=weight.unflatten(0, size), joints=joint_pairs(joint, self.kinds, *ranges)
+            )
             for weight, size, joint in zip(weights.split(rows), sizes, joints, strict=True)
         )
         return one, other
-
-    def _joints(self, pooled: Float[Tensor, "B2 C"]) -> Float[Tensor, "B2 J 8"]:
-        return at_least_float32(self.joint(pooled)).unflatten(1, (len(self.kinds), 8))
-
-    def _read(self, numbers: Float[Tensor, "B J 8"]) -> JointPairs:
-        """Pivot, direction, and two states within half the range of 0."""
-        pivot, axis, state = numbers.split((3, 3, 2), -1)
-        reach = {"revolute": self.config.revolute_range, "prismatic": self.config.prismatic_range}
-        scale = state.new_tensor([reach[kind] for kind in self.kinds])[:, None]
-        return JointPairs(
-            pivot=pivot,
-            axis=F.normalize(axis, dim=-1),
-            state=scale * (torch.sigmoid(state) - 0.5),
-        )

@@ -38,7 +38,7 @@ from scapo.first_weights import initialise
 from scapo.geometry.points import Similarity, normalise
 from scapo.geometry.rigid import apply, random_rotations, rigid
 from scapo.method import AbstractMethod, Mode, Stage, Step, StepDecay, changes
-from scapo.paper.heads import thin
+from scapo.paper.heads import opalign_record, thin
 from scapo.paper.losses import labelled, shape_variance, state_gauge
 from scapo.paper.skinning import cross_maps, part_maps
 from scapo.pictures import Panel, PictureData
@@ -443,7 +443,7 @@ class OpAlign(AbstractMethod):
             ),
             canonical_points=e.shape.points / scale[..., None],
             canonical_part=e.canonical.weights.argmax(-1),
-            record=opalign_record(e),
+            record=opalign_record(e.rotation, e.translation, joints, canonical),
         )
 
     def _slides(self, like: Tensor) -> Bool[Tensor, " J"]:
@@ -462,18 +462,6 @@ class OpAlign(AbstractMethod):
             name: PictureData(panels=_panels(shape, said), caption=caption)
             for name, (shape, said, caption) in pairs.items()
         }
-
-
-def opalign_record(e: Alignment) -> dict[str, Tensor]:
-    """What the released evaluator asks of a network, under its names."""
-    record = {"R_select": e.rotation, "T_select": e.translation}
-    for letter, joints in (("S", e.observed.joints), ("I", e.canonical.joints)):
-        record |= {
-            f"{letter}_joint": joints.pivot,
-            f"{letter}_drct": joints.axis,
-            f"{letter}_angl": joints.state,
-        }
-    return record
 
 
 def _disturbed(one: Articulation, noise: Float[Tensor, "B J 3"]) -> Articulation:

@@ -24,7 +24,6 @@ from bench.baselines.supervised import (
     GROW,
     LearningConfig,
     augmented,
-    gram_schmidt,
     penalties,
 )
 from bench.matching import reorder_poses
@@ -38,7 +37,7 @@ from scapo.paper.losses import least_costly
 from scapo.types import Observation
 from tests.helpers import made
 from tests.helpers.hinged import plates
-from tests.helpers.strategies import generator, is_rotation, normal, rigid_motions, rotations
+from tests.helpers.strategies import generator, normal, rigid_motions, rotations
 from tests.helpers.supervised import lean, target_of
 
 
@@ -182,15 +181,6 @@ def test_votes_make_poses_that_bad_votes_do_not_spoil() -> None:
     assert (found - target.pose).abs().max() < 0.02
     weight[:, :40] = 0
     assert_close(poses_by_vote(points, votes, weight), target.pose, atol=1e-6, rtol=0)
-
-
-def test_gram_schmidt_gives_rotations_that_keep_the_first_axis() -> None:
-    a, b = normal(0, 5, 3), normal(1, 5, 3)
-    rotation = gram_schmidt(a, b)
-    assert is_rotation(rotation, 1e-9).all()
-    assert_close(rotation[..., 0], F.normalize(a, dim=-1))
-    exact = rotations(3, 4)
-    assert_close(gram_schmidt(exact[..., 0], exact[..., 1]), exact)
 
 
 def test_the_mean_of_poses_about_one_is_that_one() -> None:

@@ -20,6 +20,7 @@ from tests.helpers.strategies import (
     joints,
     normal,
     rigid_motions,
+    rotations,
     seeds,
     unit_vectors,
 )
@@ -200,3 +201,12 @@ def test_skew_matrix_is_the_cross_product() -> None:
     v, x = normal(0, 4, 3), normal(1, 4, 3)
     crossed = (geometry.skew_matrix(v) @ x[..., None])[..., 0]
     np.testing.assert_allclose(crossed.numpy(), np.cross(v.numpy(), x.numpy()))
+
+
+def test_gram_schmidt_gives_rotations_that_keep_the_first_axis() -> None:
+    a, b = normal(0, 5, 3), normal(1, 5, 3)
+    rotation = geometry.gram_schmidt(a, b)
+    assert is_rotation(rotation, 1e-9).all()
+    assert_close(rotation[..., 0], torch.nn.functional.normalize(a, dim=-1))
+    exact = rotations(3, 4)
+    assert_close(geometry.gram_schmidt(exact[..., 0], exact[..., 1]), exact)

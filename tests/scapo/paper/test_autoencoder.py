@@ -19,7 +19,6 @@ from scapo.paper.autoencoder import (
     Encoder,
     EncoderConfig,
     Encoding,
-    gram_schmidt,
     mean_encoding,
     project,
 )
@@ -97,14 +96,6 @@ def test_align_and_place_are_inverse() -> None:
     assert_close(encoding.place(encoding.align(points)), points)
     zero = torch.zeros(2, 1, 3)
     assert_close(encoding.place(zero)[:, 0], encoding.translation)
-
-
-def test_gram_schmidt_keeps_the_first_axis() -> None:
-    frame = normal(1, 10, 3, 3)
-    found = gram_schmidt(frame)
-    assert bool(is_rotation(found, 1e-12).all())
-    first = frame[..., 0] / frame[..., 0].norm(dim=-1, keepdim=True)
-    assert_close(found[..., 0], first)
 
 
 @pytest.mark.parametrize("name", ["hypotheses", "hypotheses by votes"])

@@ -6,15 +6,16 @@ from __future__ import annotations
 import torch
 
 from scapo.geometry.points import normalise
-from scapo.paper.method import opalign_record
 from tests.helpers.tiny import tiny, tiny_data
 
 
 def test_its_pose_aligns_the_cloud_as_the_network_does() -> None:
-    points, _ = normalise(tiny_data(4).observation.points)
+    model, observation = tiny().eval(), tiny_data(4).observation
+    points, _ = normalise(observation.points)
     with torch.no_grad():
-        explanation = tiny().eval().explain(points)
-    record = opalign_record(explanation)
+        explanation = model.explain(points)
+    record = model.predict(observation).record
+    assert record is not None
     # Rows: R^T x - T of every point.
     aligned = points @ record["R_select"] - record["T_select"][:, None]
     assert torch.allclose(aligned, explanation.aligned, atol=1e-5)
