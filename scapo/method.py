@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
@@ -79,6 +80,14 @@ def own_generators(generator: torch.Generator, count: int) -> list[torch.Generat
     """Generators on the host, seeded by one, for what is done side by side (`Journal.ahead`)."""
     seeds = torch.randint(SEEDS, (count,), generator=generator, device=generator.device)
     return [torch.Generator().manual_seed(seed) for seed in seeds.tolist()]
+
+
+def drawing(
+    make: Callable[..., T], items: Sequence[Any], rest: tuple[Any, ...], generator: torch.Generator
+) -> list[partial[T]]:
+    """Jobs to be done side by side: `make` of each item, the rest and a generator of its own."""
+    own = own_generators(generator, len(items))
+    return [partial(make, item, *rest, one) for item, one in zip(items, own, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

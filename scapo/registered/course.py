@@ -9,7 +9,7 @@ do those side by side that need nothing of one another.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import comb
 from typing import Any, TypeVar
@@ -160,10 +160,10 @@ class Course:
             name, partial(self._timed, name, make), self.generator, self.makers
         )
 
-    def steps(self, makes: Mapping[str, Callable[[], T]]) -> list[T]:
+    def steps(self, names: Sequence[str], makes: Sequence[Callable[[], T]]) -> list[T]:
         """What steps make that need nothing of one another: side by side where that is possible."""
-        ahead = self.journal.ahead(list(makes.values()))
-        return [self.step(name, make) for name, make in zip(makes, ahead, strict=True)]
+        ahead = self.journal.ahead(makes)
+        return [self.step(name, make) for name, make in zip(names, ahead, strict=True)]
 
     def _timed(self, name: str, make: Callable[[], T]) -> T:
         began = time.monotonic()

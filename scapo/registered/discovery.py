@@ -18,14 +18,14 @@ another candidate.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 
 from scapo.categories import JointKind
-from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
+from scapo.method import NO_JOURNAL, Journal, drawing, evenly
 from scapo.records import take
 from scapo.registered.axis_deviation import with_axis_deviation
 from scapo.registered.bundle_adjustment import Candidate, densified, refit
@@ -155,12 +155,8 @@ def _known_objects(
     course: Course,
 ) -> list[OneObject]:
     """The objects each by itself, the surest first."""
-    names, own = numbered("object", len(objects)), own_generators(course.generator, len(objects))
-    jobs = {
-        name: partial(one_object, views, kinds, config, generator)
-        for name, views, generator in zip(names, objects, own, strict=True)
-    }
-    return surest_first(course.steps(jobs))
+    jobs = drawing(one_object, objects, (kinds, config), course.generator)
+    return surest_first(course.steps(numbered("object", len(objects)), jobs))
 
 
 def _of_objects(
@@ -168,12 +164,9 @@ def _of_objects(
 ) -> list[Candidate]:
     """The first candidates of all draws of objects."""
     draws = draws_of(known, config.draws)
-    names, own = numbered("draw", len(draws)), own_generators(course.generator, len(draws))
-    jobs = {
-        f"{name}, template": partial(object_candidate, draw, kinds, config, generator)
-        for name, draw, generator in zip(names, draws, own, strict=True)
-    }
-    return course.steps(jobs)
+    names = [f"{name}, template" for name in numbered("draw", len(draws))]
+    jobs = drawing(object_candidate, draws, (kinds, config), course.generator)
+    return course.steps(names, jobs)
 
 
 def _how_objects_stand(
@@ -200,12 +193,8 @@ def _best(
     left = [tried[k] for k in order[: config.finalists]]
     for rung, share in zip(numbered("rung", len(config.heats)), config.heats, strict=True):
         names = [f"{rung}, {one}" for one in numbered("template", len(left))]
-        own = own_generators(course.generator, len(left))
-        jobs = {
-            name: partial(advance, one, searched, share, config, generator)
-            for name, one, generator in zip(names, left, own, strict=True)
-        }
-        left = course.steps(jobs)
+        jobs = drawing(advance, left, (searched, share, config), course.generator)
+        left = course.steps(names, jobs)
     judging = partial(ranked, left, judges, config, course.journal)
     return left[course.step("judging templates", judging)[0]]
 
@@ -299,13 +288,9 @@ def completed(
         judging = partial(ranked, pairs, judges, config, course.journal)
         several.append(pairs[course.step("judging pairs of parts", judging)[0]])
     names = [f"{first}, {one}" for one in numbered("mirror image", len(several))]
-    own, jobs = own_generators(course.generator, len(names)), dict[str, Callable[[], Candidate]]()
-    for name, one, generator in zip(names, several, own, strict=True):
-        jobs[name] = partial(
-            advance, one, searched, config.trusted[0], config, generator,
-            anywhere=any(one is whole for whole in wholes),
-        )  # fmt: skip
-    tried = course.steps(jobs)
+    jobs = drawing(advance, several, (searched, config.trusted[0], config), course.generator)
+    jobs = [partial(job, anywhere=0 < k <= len(wholes)) for k, job in enumerate(jobs)]
+    tried = course.steps(names, jobs)
     judging = partial(_dense_losses, tried, judges, config, course)
     losses = course.step("judging mirror images", judging)
     best = min(range(len(tried)), key=losses.__getitem__)
@@ -350,11 +335,7 @@ def _dense_losses(
     course: Course,
 ) -> list[float]:
     """What held-out views cost the candidates with dense templates."""
-    own = own_generators(course.generator, len(tried))
-    jobs = [
-        partial(_dense_loss, one, judges, config, generator)
-        for one, generator in zip(tried, own, strict=True)
-    ]
+    jobs = drawing(_dense_loss, tried, (judges, config), course.generator)
     return [job() for job in course.journal.ahead(jobs)]
 
 

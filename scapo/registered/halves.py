@@ -26,7 +26,7 @@ from torch import Tensor
 
 from scapo.geometry.points import ends
 from scapo.geometry.rotations import rotvec_to_rotmat
-from scapo.method import NO_JOURNAL, Journal, evenly, own_generators
+from scapo.method import NO_JOURNAL, Journal, drawing, evenly
 from scapo.records import take
 from scapo.registered.bundle_adjustment import (
     BLUNT,
@@ -194,11 +194,7 @@ def in_halves(
     starts = (at_rest(placement), to_the_middle(template, placement))
     fits = [_Fit(cut, start) for start in starts for cut in cuts(template)]
     for number, kept in enumerate(KEPT):
-        own = own_generators(generator, len(fits))
-        jobs = [
-            partial(_round, fit, views, one, number=number)
-            for fit, one in zip(fits, own, strict=True)
-        ]
+        jobs = drawing(partial(_round, number=number), fits, (views,), generator)
         fits = [job() for job in journal.ahead(jobs)]
         fits = sorted(fits, key=lambda fit: fit.loss)[:kept]
         logger.info("cuts in two fitted: %s", " ".join(f"{fit.loss:.4f}" for fit in fits))
