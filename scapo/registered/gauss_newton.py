@@ -12,15 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from scapo.geometry.rigid import skew_matrix
+
 
 def by_turn(arm: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3 3"]:
     """What a small turn about each coordinate axis (column) moves points by, `arm` off the centre.
 
-    Column a is e_a x arm, written out: the product is twice as slow.
+    Column a is e_a x arm.
     """
-    x, y, z = arm.unbind(-1)
-    none = torch.zeros_like(x)
-    return torch.stack([none, z, -y, -z, none, x, y, -x, none], -1).unflatten(-1, (3, 3))
+    return skew_matrix(-arm)
 
 
 def weighted_equations(
