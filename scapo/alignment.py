@@ -202,15 +202,9 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ObjectFrame:
+class ObjectFrame(LabelledClouds):
     """The labelled clouds by which answers without pose labels came into the object's frame."""
 
-    split: str
-    data_digest: str
-    """Of the split's manifest."""
-    samples: int
-    mode: str = ""
-    """Of prediction, in which they were asked."""
     order: tuple[int, ...] = ()
     """The part that each of the method's slots became, for `record_*`; empty: as they were."""
 
