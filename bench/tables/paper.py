@@ -78,8 +78,7 @@ def mean_mismatches(cells: Cells) -> list[Mismatch]:
     for (table, metric, method, category), cell in cells.items():
         if category != MEAN or table == "3":
             continue
-        row = row_cells(cells, table, metric, method)
-        mean = sum(c.value for c in row) / len(row)
+        mean = _mean(cells, table, metric, method)
         if abs(mean - cell.value) > cell.step * (1 + 1e-6):
             found.append(
                 Mismatch(
