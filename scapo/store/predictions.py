@@ -75,22 +75,11 @@ class Header:
     own."""
 
     def record(self) -> dict[str, Any]:
-        """As stored in the file."""
-        return {
-            "format": PREDICTIONS,
-            "method": self.method,
-            "variant": self.variant,
-            "category": self.category,
-            "split": self.split,
-            "seed": self.seed,
-            "data_digest": self.data_digest,
-            "supervision": sorted(self.supervision),
-            "budget": self.budget,
-            "run": self.run,
-            **({} if self.camera is None else {"camera": self.camera}),
-            **({} if self.definition is None else definition(self.definition)),
-            **({} if self.object_frame is None else {"object_frame": asdict(self.object_frame)}),
-        }
+        """As stored in the file, without what is not said."""
+        own = asdict(replace(self, definition=None))
+        said = {name: value for name, value in own.items() if value is not None}
+        kind = {} if self.definition is None else definition(self.definition)
+        return {**said, "format": PREDICTIONS, "supervision": sorted(self.supervision), **kind}
 
 
 def write_predictions(path: Path, header: Header, arrays: Mapping[str, np.ndarray]) -> str:
