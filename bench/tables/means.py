@@ -79,8 +79,9 @@ def table_1(results: Results, kind: Kind, cells: Cells, wrong: Sequence[Mismatch
     """Mean errors on synthetic objects; the paper's beside them but for parts seen alone."""
 
     def printed(measure: Measure) -> list[Row]:
-        columns = (*TABLE_1_CATEGORIES, MEAN)
-        return printed_rows(cells, wrong, "1", measure.key, columns)
+        columns = [(measure.key, name) for name in (*TABLE_1_CATEGORIES, MEAN)]
+        rows = printed_rows(cells, wrong, "1", columns)
+        return [row for row in rows if measure.printed or not row.empty]
 
     grid = Grid(
         results=results,

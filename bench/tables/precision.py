@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from bench.metrics import ApRule
 from bench.tables.means import measured_in
@@ -27,9 +28,9 @@ from bench.tables.rows import (
     left_out,
     line_row,
     lines_of,
+    printed_rows,
 )
 from bench.tables.spec import (
-    PAPER_METHODS,
     PRECISION_GROUPS,
     PRECISION_HEADINGS,
     PRECISION_KEYS,
@@ -52,7 +53,8 @@ def table_2(results: Results, cells: Cells, wrong: Sequence[Mismatch], rule: ApR
     ]  # fmt: skip
     candidates: list[tuple[str, list[Row]]] = []
     for number, name in enumerate((*TABLE_2_CATEGORIES, MEAN)):
-        rows = _printed_precision(cells, wrong, name)
+        printed = printed_rows(cells, wrong, "2", [(key, name) for key in PRECISION_KEYS])
+        rows = [replace(row, cells=(*row.cells, *(Cell() for _ in MORE))) for row in printed]
         for line, found in ours:
             row = [_mean(column) for column in zip(*found, strict=True)] if name == MEAN else [
                 _cell(part) for part in found[number]
@@ -107,25 +109,3 @@ def _mean(column: Sequence[Sampled | Cell | None]) -> Cell:
     if len(known) < len(column):
         return Cell()
     return Cell(value=sum(known) / len(known), decimals=cells[0].decimals)
-
-
-def _printed_precision(cells: Cells, wrong: Sequence[Mismatch], category: str) -> list[Row]:
-    flagged = {(m.metric, m.method) for m in wrong if m.table == "2"}
-    rows = []
-    for method in dict.fromkeys(key[2] for key in cells if key[0] == "2"):
-        found = [cells["2", key, method, category] for key in PRECISION_KEYS]
-        row = [
-            Cell(
-                value=cell.value, text=cell.text, flag=category == MEAN and (key, method) in flagged
-            )
-            for key, cell in zip(PRECISION_KEYS, found, strict=True)
-        ]
-        rows.append(
-            Row(
-                method=PAPER_METHODS.get(method, method),
-                source="paper",
-                marks=found[0].marks,
-                cells=(*row, *(Cell() for _ in MORE)),
-            )
-        )
-    return rows

@@ -28,34 +28,34 @@ from bench.tables.spec import (
     PUBLISHED,
     READINGS,
     REFERENCE,
-    TABLE_1,
 )
 from scapo.text import one_line
 
 
 def printed_rows(
-    cells: Cells, wrong: Sequence[Mismatch], table: str, metric: str, columns: Sequence[str]
+    cells: Cells, wrong: Sequence[Mismatch], table: str, columns: Sequence[tuple[str, str]]
 ) -> list[Row]:
-    """The paper's rows of one metric over categories; a cell that it has not is a dash."""
+    """The paper's rows of a table, by metric and category of each column; what it lacks is a dash.
+
+    Args:
+        cells: All that is printed.
+        wrong: Printed means to be flagged.
+        table: Its number.
+        columns: Metric and category of each.
+    """
     flagged = {(m.table, m.metric, m.method) for m in wrong}
-    methods = dict.fromkeys(key[2] for key in cells if key[0] == table)
     rows = []
-    for method in methods:
-        found = [cells.get((table, metric, method, name)) for name in columns]
+    for method in dict.fromkeys(key[2] for key in cells if key[0] == table):
         marks = next(cell.marks for key, cell in cells.items() if key[::2] == (table, method))
-        row = tuple(
-            Cell() if cell is None else Cell(
-                value=cell.value, text=cell.text,
-                flag=name == MEAN and (table, metric, method) in flagged,
+        row = list[Cell]()
+        for metric, category in columns:
+            cell = cells.get((table, metric, method, category))
+            flag = category == MEAN and (table, metric, method) in flagged
+            row.append(
+                Cell() if cell is None else Cell(value=cell.value, text=cell.text, flag=flag)
             )
-            for name, cell in zip(columns, found, strict=True)
-        )  # fmt: skip
-        if any(cell.value is not None for cell in row) or metric in {m.key for m in TABLE_1[:5]}:
-            rows.append(
-                Row(
-                    method=PAPER_METHODS.get(method, method), source="paper", marks=marks, cells=row
-                )
-            )
+        name = PAPER_METHODS.get(method, method)
+        rows.append(Row(method=name, source="paper", marks=marks, cells=tuple(row)))
     return rows
 
 
