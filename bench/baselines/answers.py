@@ -216,19 +216,21 @@ def states(
     pose: Float[Tensor, "B P 4 4"],
     axis: Float[Tensor, "B J 3"],
     category: Category,
+    scale: Float[Tensor, " B"],
 ) -> Float[Tensor, "B J"]:
-    """How far each joint is from rest, by the poses of its parts: about or along the axis.
+    """How far each joint is from rest, by the poses of its parts: about or along the axis; rad, m.
 
     Args:
         pose: Of the parts.
         axis: Unit vectors, in the frame of the base.
         category: Says which parts a joint links and how.
+        scale: Length of a metre in the unit of the poses, of each cloud.
     """
     found = []
     for j, joint in enumerate(category.joints):
         motion = invert(pose[:, joint.parent]) @ pose[:, joint.child]
-        step = motion[:, :3, 3]
         if joint.kind == "revolute":
-            step = rotmat_to_rotvec(motion[:, :3, :3])
-        found.append((step * axis[:, j]).sum(-1))
+            found.append((rotmat_to_rotvec(motion[:, :3, :3]) * axis[:, j]).sum(-1))
+        else:
+            found.append((motion[:, :3, 3] * axis[:, j]).sum(-1) / scale)
     return torch.stack(found, 1)

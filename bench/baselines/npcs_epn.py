@@ -265,15 +265,14 @@ class NpcsEpn(AbstractMethod):
         pose = rigid(rotation, torch.stack([pose.shift for pose in poses], 1))
         pivot, axis = self._joints(points, answer, rotation)
         base = rotation[:, 0]
-        state = states(pose, (axis[:, :, None] @ base[:, None])[:, :, 0], self.category)
-        slide = torch.tensor([joint.kind == "prismatic" for joint in self.category.joints])
+        own = (axis[:, :, None] @ base[:, None])[:, :, 0]
         return Prediction(
             part_weight=answer.part.softmax(-1),
             camera_T_part=similarity.inverse_pose(pose),
             joints=Joints(
                 pivot=similarity.inverse(pivot),
                 axis=axis,
-                state=torch.where(slide.to(state.device), state / similarity.scale[:, None], state),
+                state=states(pose, own, self.category, similarity.scale),
             ),
         )
 

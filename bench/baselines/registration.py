@@ -27,11 +27,11 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from bench.baselines.answers import states
 from bench.baselines.templates import LEAST_POINTS, NAMES, FusionConfig, Templates, fuse
 from scapo.categories import Category
 from scapo.geometry.points import MEAN_RADIUS, Similarity, normalise
 from scapo.geometry.rigid import invert
-from scapo.geometry.rotations import rotmat_to_rotvec
 from scapo.method import Mode, OracleMethod, Stage, Step, changes
 from scapo.ranges import Positive
 from scapo.types import Joints, Labels, Observation, Prediction, Supervision
@@ -222,14 +222,10 @@ class AbstractRegistration(OracleMethod):
         """The joints of the base's template, where the base is; states from the part poses."""
         turn, move = pose[:, 0, :3, :3], pose[:, 0, :3, 3]
         pivot, axis = templates.pivot[base], templates.axis[base]
-        motion = invert(pose[:, :1]) @ pose[:, 1:]
-        sliding = torch.tensor([joint.kind == "prismatic" for joint in self.category.joints])
-        length = (motion[..., :3, 3] * axis).sum(-1) / similarity.scale[:, None]
-        angle = (rotmat_to_rotvec(motion[..., :3, :3]) * axis).sum(-1)
         return Joints(
             pivot=similarity.inverse(pivot @ turn.mT + move[:, None]),
             axis=axis @ turn.mT,
-            state=torch.where(sliding, length, angle),
+            state=states(pose, axis, self.category, similarity.scale),
         )
 
     def _register(self, points: Points, targets: list[Target]) -> Match | None:

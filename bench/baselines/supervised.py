@@ -321,9 +321,6 @@ class SupervisedMethod(AbstractMethod, ABC):
         pose = poses_of(GROW * points, answer)
         axis, base = F.normalize(answer.axis, dim=-1), pose[:, 0]
         pivot = apply(base, answer.pivot)
-        state = states(pose, axis, self.category)
-        slide = torch.tensor([joint.kind == "prismatic" for joint in self.category.joints])
-        scale = GROW * similarity.scale[:, None]
         metric = pose.clone()
         metric[..., :3, 3] = similarity.inverse(pose[..., :3, 3] / GROW)
         return Prediction(
@@ -332,7 +329,7 @@ class SupervisedMethod(AbstractMethod, ABC):
             joints=Joints(
                 pivot=similarity.inverse(pivot / GROW),
                 axis=axis @ base[:, :3, :3].mT,
-                state=torch.where(slide.to(state.device), state / scale, state),
+                state=states(pose, axis, self.category, GROW * similarity.scale),
             ),
         )
 

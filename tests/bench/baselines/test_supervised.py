@@ -145,7 +145,7 @@ def test_the_exchanged_joint_opens_the_same_way() -> None:
     for one in (target, other):
         axis = one.axis @ invert(one.pose[:, 0])[:, :3, :3].mT
         assert labels.joints is not None
-        found = states(one.pose, axis, CATEGORIES["laptop"])
+        found = states(one.pose, axis, CATEGORIES["laptop"], torch.ones(len(axis)))
         assert_close(found, labels.joints.state, atol=1e-4, rtol=0)
 
 
@@ -196,7 +196,7 @@ def test_states_are_those_of_the_data(category: str) -> None:
     pose = torch.from_numpy(arrays["camera_T_part"])
     base = invert(pose[:, 0])[:, :3, :3]
     axis = torch.from_numpy(arrays["joint_axis"]) @ base.mT
-    found = states(pose, axis, CATEGORIES[category])
+    found = states(pose, axis, CATEGORIES[category], torch.ones(6))
     assert_close(found, torch.from_numpy(arrays["joint_state"]), atol=1e-4, rtol=0)
 
 
