@@ -6,14 +6,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from bench.baselines import gcn3d, pointnet2
 from bench.baselines.answers import Target
 from bench.baselines.supervised import SupervisedMethod
+from bench.metrics import sample_errors
 from scapo.categories import CATEGORIES
-from scapo.method import Step
+from scapo.method import AbstractMethod, Step
 from scapo.types import Labels, Observation
 from tests.helpers.strategies import generator
 
@@ -60,3 +62,24 @@ def target_of(observation: Observation, labels: Labels) -> tuple[Target, Tensor]
         axis=labels.joints.axis,
     )
     return target, observation.points
+
+
+def errors_of(
+    method: AbstractMethod, observation: Observation, labels: Labels
+) -> dict[str, np.ndarray]:
+    """Of predictions, as the benchmark measures them."""
+    target, _ = target_of(observation, labels)
+    prediction = method.predict(observation)
+    assert prediction.camera_T_part is not None
+    assert prediction.joints is not None
+    return sample_errors(
+        part_true=target.part.numpy(),
+        camera_T_part_true=target.pose.numpy(),
+        pivot_true=target.pivot.numpy(),
+        axis_true=target.axis.numpy(),
+        part_pred=prediction.part_weight.numpy(),
+        camera_T_part_pred=prediction.camera_T_part.numpy(),
+        pivot_pred=prediction.joints.pivot.numpy(),
+        axis_pred=prediction.joints.axis.numpy(),
+        symmetry=np.array(method.category.symmetry),
+    )

@@ -19,7 +19,6 @@ from bench.baselines.npcs_epn import (
     median,
     nearby,
 )
-from bench.metrics import sample_errors
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron
 from scapo.geometry.rigid import point_line_distance
@@ -27,6 +26,7 @@ from scapo.method import HalfCosine, Step, StepDecay
 from scapo.types import Labels, Observation
 from tests.helpers.hinged import plates
 from tests.helpers.strategies import generator, is_rotation, normal
+from tests.helpers.supervised import errors_of
 
 LAPTOP = CATEGORIES["laptop"]
 TINY = replace(
@@ -82,30 +82,17 @@ def learned() -> tuple[NpcsEpn, Observation, Labels, float]:
 
 def test_it_overfits_a_batch(learned: tuple[NpcsEpn, Observation, Labels, float]) -> None:
     method, observation, labels, loss = learned
-    found = method.predict(observation)
-    assert labels.part is not None
-    assert labels.camera_T_part is not None
-    assert labels.joints is not None
-    assert found.camera_T_part is not None
-    assert found.joints is not None
-    errors = sample_errors(
-        part_true=labels.part.numpy(),
-        camera_T_part_true=labels.camera_T_part.numpy(),
-        pivot_true=labels.joints.pivot.numpy(),
-        axis_true=labels.joints.axis.numpy(),
-        part_pred=found.part_weight.numpy(),
-        camera_T_part_pred=found.camera_T_part.numpy(),
-        pivot_pred=found.joints.pivot.numpy(),
-        axis_pred=found.joints.axis.numpy(),
-        symmetry=torch.tensor(LAPTOP.symmetry).numpy(),
-    )
+    errors = errors_of(method, observation, labels)
     assert loss < 0.5
     assert errors["iou"].min() > 0.95
     assert errors["part_rotation"].max() < 2
     assert errors["part_translation"].max() < 0.02
     assert errors["joint_direction"].max() < 1
     assert errors["joint_pivot"].max() < 0.03
-    assert_close(found.joints.state, labels.joints.state, atol=0.02, rtol=0)
+    found = method.predict(observation).joints
+    assert found is not None
+    assert labels.joints is not None
+    assert_close(found.state, labels.joints.state, atol=0.02, rtol=0)
 
 
 def test_the_prediction_turns_with_the_cloud(

@@ -18,9 +18,7 @@ from bench.baselines import gcn3d, pointnet2
 from bench.baselines.supervised import (
     GROW,
     LearningConfig,
-    SupervisedMethod,
 )
-from bench.metrics import sample_errors
 from bench.scoring.score_files import read_scores
 from bench.scoring.scores import to_arrays
 from scapo.categories import CATEGORIES
@@ -29,11 +27,11 @@ from scapo.records import take
 from scapo.store.files import read
 from scapo.training.fit import FitConfig, fit
 from scapo.training.precision import Arithmetic, applied
-from scapo.types import Labels, Observation
+from scapo.types import Observation
 from tests.helpers.hinged import plates
 from tests.helpers.small import FLAGS, hinged_data
 from tests.helpers.strategies import generator
-from tests.helpers.supervised import MAKERS, NAMES, a_step, lean, target_of
+from tests.helpers.supervised import MAKERS, NAMES, a_step, errors_of, lean
 from tests.helpers.tiny import tiny_data
 
 
@@ -81,26 +79,6 @@ def test_one_batch_is_learned_by_heart(name: str, pose: str, steps: int) -> None
     assert errors["joint_direction"].mean() < 7
     assert errors["part_translation"].mean() < 0.07
     assert errors["joint_pivot"].mean() < 0.05
-
-
-def errors_of(
-    method: SupervisedMethod, observation: Observation, labels: Labels
-) -> dict[str, np.ndarray]:
-    target, _ = target_of(observation, labels)
-    prediction = method.predict(observation)
-    assert prediction.camera_T_part is not None
-    assert prediction.joints is not None
-    return sample_errors(
-        part_true=target.part.numpy(),
-        camera_T_part_true=target.pose.numpy(),
-        pivot_true=target.pivot.numpy(),
-        axis_true=target.axis.numpy(),
-        part_pred=prediction.part_weight.numpy(),
-        camera_T_part_pred=prediction.camera_T_part.numpy(),
-        pivot_pred=prediction.joints.pivot.numpy(),
-        axis_pred=prediction.joints.axis.numpy(),
-        symmetry=np.array(method.category.symmetry),
-    )
 
 
 @pytest.mark.parametrize("name", NAMES)
