@@ -106,8 +106,8 @@ def with_axis_deviation(
     if "revolute" not in template.kinds:
         return start
     options, placed = late_options(template, config), None
-    for span in _spans(template):
-        tried = [start, *deviating_templates(start, options, generator, journal, span)]
+    for parallel in (True, False) if _parallel(template) else (False,):
+        tried = [start, *deviating_templates(start, options, generator, journal, parallel)]
         if len(tried) == 1:
             continue
         if placed is None:
@@ -120,24 +120,31 @@ def with_axis_deviation(
         said = " ".join(f"{x:.3f}" for x in losses)
         logger.info("templates with axis deviation judged: %s", said)
         best = min(range(len(tried)), key=losses.__getitem__)
-        asked = LEAST_GAIN if span is None else LEAST_GAIN_PARALLEL
+        asked = LEAST_GAIN_PARALLEL if parallel else LEAST_GAIN
         if losses[best] < (1 - asked) * losses[0]:
             return tried[best]
     return start
 
 
-def _spans(template: ArticulatedTemplate) -> list[Float[Tensor, "D E"] | None]:
-    """Of the loads that are looked for, the first that explains enough is taken.
+def _parallel(template: ArticulatedTemplate) -> bool:
+    """Whether there are several hinges, all along one direction.
 
-    Where hinges are parallel, those by which they stay parallel come first: any load at all is four
-    numbers for two hinges, and thin parts tell these too badly.
+    Loads by which they stay so are looked for first: any load at all is four numbers for two
+    hinges, and thin parts tell these too badly.
     """
     axes = template.directions().detach()
     apart = (axes @ axes[0]).abs()
-    if len(axes) < 2 or "prismatic" in template.kinds or bool((apart < SQUARE).any()):
-        return [None]
-    first = across_axis(axes[0])
-    return [torch.cat([across_axis(axis) @ first.T for axis in axes]), None]
+    return len(axes) > 1 and "prismatic" not in template.kinds and bool((apart >= SQUARE).all())
+
+
+def _span(template: ArticulatedTemplate) -> Float[Tensor, "D 2"]:
+    """Loads by which all hinges deviate alike, in the directions across each as it is now.
+
+    They are not those across it a moment ago: of an axis along the frame a small turn exchanges
+    the two (`across_axis`).
+    """
+    first, *others = (across_axis(axis) for axis in template.directions())
+    return torch.cat([across @ first.T for across in (first, *others)])
 
 
 def deviating_templates(
@@ -145,7 +152,7 @@ def deviating_templates(
     options: FitOptions,
     generator: torch.Generator,
     journal: Journal = NO_JOURNAL,
-    span: Float[Tensor, "D E"] | None = None,
+    parallel: bool = False,
 ) -> list[Candidate]:
     """Templates whose axes deviate, one for each choice of ends at which they rest.
 
@@ -154,7 +161,7 @@ def deviating_templates(
         options: Of the fits.
         generator: Of the draws in between.
         journal: Of the training.
-        span: Of the loads (`learn_deviations`).
+        parallel: Whether hinges stay parallel.
 
     Returns:
         Templates with the same views; none where the axes deviate too little.
@@ -164,13 +171,14 @@ def deviating_templates(
     rests = _rests(limits_of(placement.state, start.template.kinds))
     own, jobs = own_generators(generator, len(rests)), list[Callable[[], Candidate]]()
     for ends, one in zip(rests, own, strict=True):
+        span = _span(thin) if parallel else None
         model = learn_deviations(observed, placement.state, ends, span)
         if float(model.load.unflatten(0, (-1, 2)).norm(dim=-1).max()) >= LEAST_DEVIATION:
             template = thin.with_points(len(thin.points))
             keep(template, model)
             at = with_deviations(template, observed, placement)
             found = Candidate(template=template, inliers=Inliers(views=views, placement=at))
-            jobs.append(partial(_fitted, found, ends, span, options, one))
+            jobs.append(partial(_fitted, found, ends, parallel, options, one))
     return [job() for job in journal.ahead(jobs)]
 
 
@@ -204,7 +212,7 @@ def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:
 def _fitted(
     found: Candidate,
     rests: Float[Tensor, "J R"],
-    span: Float[Tensor, "D E"] | None,
+    parallel: bool,
     options: FitOptions,
     generator: torch.Generator,
 ) -> Candidate:
@@ -218,6 +226,7 @@ def _fitted(
             rebuild(template, views, placement, settled=True, generator=generator)
         placement, _ = bundle_adjust(template, views, placement, options, generator=generator)
         observed = observe_part_rotations(template, views, placement, REACHES)
+        span = _span(template) if parallel else None
         keep(template, learn_deviations(observed, placement.state, rests, span))
         placement = with_deviations(template, observed, placement)
     square_axes(template)
