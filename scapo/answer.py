@@ -16,7 +16,7 @@ from torch import Tensor
 
 from scapo.alignment import Alignment, unit_length
 from scapo.method import AbstractMethod, Mode
-from scapo.records import cat, take
+from scapo.records import either
 from scapo.types import Observation, Prediction
 
 ASIDE = (-1.0, 1.0, 1.0)
@@ -49,8 +49,7 @@ def answered(
         return found
     other = mirrored(_aligned(method, _mirror_image(observation), mode, alignment))
     assert other.misfit is not None  # noqa: S101 - as the other has
-    row = torch.arange(len(found.misfit), device=found.misfit.device)
-    return take(cat([found, other]), row + len(row) * (other.misfit < BETTER * found.misfit))
+    return either(other.misfit < BETTER * found.misfit, other, found)
 
 
 def hangs_aside(method: AbstractMethod) -> bool:
