@@ -93,6 +93,7 @@ def _said(
         log_scale=said.log_scale + size.log(),
         state=torch.where(template.sliding[:, 0] > 0, said.state * size, said.state),
         shift=said.shift * size[..., None],
+        pivot=None if said.pivot is None else said.pivot * size[..., None],
     )
     return placement, sure
 
@@ -152,4 +153,7 @@ def _fitted(
         cost(placed()).sum().backward()
         optimizer.step()
     end = placed()
+    if begun.pivot is not None:  # hinges sit on the base, whose sizes were fitted
+        grown = (end.log_scale - begun.log_scale).exp()
+        end = replace(end, pivot=begun.pivot * grown[:, None])
     return map_tensors(end, Tensor.detach)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import copy
+import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +14,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from scapo.geometry.points import Similarity, normalise
-from scapo.geometry.rigid import random_rotations, rotation_angle
+from scapo.geometry.rigid import point_line_distance, random_rotations, rotation_angle
 from scapo.records import take
 from scapo.registered.surfaces import SIDES, lying, misfit, seen
 from scapo.registered.template import Placement
@@ -21,13 +23,16 @@ from tests.helpers.sighted import template
 from tests.helpers.strategies import generator, normal
 
 COUNT = 4
+BESIDE = torch.tensor([0.0, 0.03, -0.05])
+"""Of an object's own hinge from the template's, in the template's size."""
 
 
 class Sighted:
     """Knows how surfaces lie when it sees them from the front; else it says anything."""
 
-    def __init__(self, truth: Placement) -> None:
-        self.truth, self.answers = truth, 0
+    def __init__(self, truth: Placement, grown: float = 1.0) -> None:
+        """Of the sizes it says so many times too much."""
+        self.truth, self.grown, self.answers = truth, math.log(grown), 0
 
     def __call__(self, observation: Observation) -> tuple[Placement, Tensor, Similarity]:
         points, similarity = normalise(observation.points)
@@ -40,8 +45,9 @@ class Sighted:
         state = torch.where(front[:, None], self.truth.state + 0.2, 0.0)
         away, size = self.truth.translation - similarity.centre, similarity.scale[:, None]
         said = Placement.at(rotation, away * size, state)
-        said.log_scale.add_(size.log())
-        return said, torch.where(front, 0.9, 0.5), similarity
+        said.log_scale.add_(size.log() + self.grown)
+        hinge = (template().pivot.detach() + BESIDE) * said.log_scale.exp()[:, None]
+        return replace(said, pivot=hinge), torch.where(front, 0.9, 0.5), similarity
 
 
 def surfaces() -> tuple[Tensor, Placement]:
@@ -71,6 +77,16 @@ def test_sides_that_agree_say_how_the_template_lies(off: float) -> None:
     assert (found.state - truth.state).abs().mean() < 0.1
     assert_close(found.translation, truth.translation, atol=0.02, rtol=0)
     assert 0.3 < share.min() <= share.max() < 1
+
+
+@pytest.mark.parametrize("grown", [1.0, 1.2])
+def test_the_hinge_that_a_side_says_is_that_of_the_surface(grown: float) -> None:
+    points, truth = surfaces()
+    found, _ = lying(template(), Sighted(truth, grown), 2.0, points)
+    pivot, axis = template().joints_in_view(found)
+    hinge = (template().pivot.detach() + BESIDE) * truth.log_scale.exp()[:, None]
+    wanted = hinge @ truth.rotation.mT + truth.translation[:, None]
+    assert point_line_distance(wanted, pivot, axis).max() < 0.02
 
 
 def test_of_a_ball_a_camera_sees_what_faces_it() -> None:
