@@ -86,6 +86,7 @@ class GreatestResponse(torch.autograd.Function):
     ) -> Tensor:
         """Directions (M, K, 3), kernels (3, C), features (R, C) or None for 1, index (M, K)."""
         rows = ROWS if directions.device.type == "cpu" else max(1, directions.shape[0])
+        number = torch.uint8 if index.shape[1] <= 256 else torch.int16
         values, winners = [], []
         for there, near in zip(directions.split(rows), index.split(rows), strict=True):
             best = winner = None
@@ -93,7 +94,7 @@ class GreatestResponse(torch.autograd.Function):
                 value = (there[:, n] @ kernels).relu_()
                 value = value if features is None else value.mul_(features[near[:, n]])
                 if best is None or winner is None:
-                    best, winner = value, torch.zeros_like(value, dtype=torch.uint8)
+                    best, winner = value, torch.zeros_like(value, dtype=number)
                     continue
                 winner.masked_fill_(value > best, n)
                 best = torch.maximum(best, value)

@@ -57,6 +57,17 @@ def test_the_greatest_response_against_loops_and_differences(
     )
 
 
+def test_the_greatest_response_of_more_neighbours_than_a_byte_counts() -> None:
+    directions = F.normalize(normal(0, 4, 300, 3), dim=-1)
+    kernels, features = normal(1, 3, 5).requires_grad_(), normal(2, 4, 5).requires_grad_()
+    index = torch.randint(4, (4, 300), generator=generator(3))
+    plain = ((directions @ kernels).relu() * features[index]).amax(1)
+    found = GreatestResponse.apply(directions, kernels, features, index)
+    assert_close(found, plain)
+    wanted = torch.autograd.grad(plain.sum(), (kernels, features))
+    assert_close(torch.autograd.grad(found.sum(), (kernels, features)), wanted)
+
+
 def test_a_graph_against_loops() -> None:
     points = normal(0, 2, 12, 3)
     found = graph(points, 4)
