@@ -26,6 +26,8 @@ RGBA = tuple[float, float, float, float]
 Vector = Float[np.ndarray, "3"]
 DENSITY = 300.0
 """kg/m3, of the bounding box of a link: furniture and appliances are mostly air."""
+BOTH_SIDES = "# nothing to add: open surfaces have both sides"
+"""First line of an OBJ that is but a piece of a surface, so that it does not show what is open."""
 _SOLID = "-collision"
 """In the names of meshes that are there for collisions alone."""
 
@@ -39,6 +41,8 @@ class Surface:
     faces: Int[np.ndarray, "F 3"]
     """Counter-clockwise seen from outside."""
     color: RGBA = (0.7, 0.7, 0.7, 1.0)
+    piece: bool = False
+    """Of a surface that other surfaces close, or that has its reverse beside it where it is open."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,7 +140,8 @@ def write_files(
     written[0].write_text(text, encoding="utf-8", newline="\n")
     for link in links:
         for file, surface in _meshes(link):
-            text = obj_text(surface.vertices - frames[link.name], surface.faces)
+            text = f"{BOTH_SIDES}\n" if surface.piece else ""
+            text += obj_text(surface.vertices - frames[link.name], surface.faces)
             (folder / file).write_text(text, encoding="ascii")
             written.append(folder / file)
     return written

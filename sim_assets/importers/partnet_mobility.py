@@ -115,7 +115,8 @@ def _name(link: str, model: ReadModel) -> str:
 
 def _surface(visual: Visual, root_T_link: np.ndarray) -> Surface:
     vertices = moved(np.asarray(visual.mesh.vertices), root_T_link)
-    return Surface(vertices=vertices, faces=np.asarray(visual.mesh.faces), color=visual.color)
+    faces = np.asarray(visual.mesh.faces)
+    return Surface(vertices=vertices, faces=faces, color=visual.color, piece=True)
 
 
 def _joint(

@@ -19,6 +19,7 @@ import trimesh
 from jaxtyping import Float, Int
 from trimesh.visual import ColorVisuals, TextureVisuals
 
+from scapo.export.urdf import BOTH_SIDES
 from scapo.geometry.matrices import moved
 from sim_assets.models.resolver import MeshResolver, SourceFiles
 from sim_assets.models.robot import Color, Robot, Shape, ShapeKind
@@ -91,7 +92,8 @@ def load_mesh(path: Path, files: SourceFiles) -> list[Visual]:
         raise refuse(path, "a mesh with triangles", "none")
     for piece in pieces:
         check_mesh(path, piece.mesh)
-    return _both_sides([_without_strays(piece) for piece in pieces], _unit(path, units))
+    add = not (form == "obj" and data.startswith(BOTH_SIDES.encode()))
+    return _both_sides([_without_strays(piece) for piece in pieces], _unit(path, units), add)
 
 
 def _claimed_faces(form: str, data: bytes) -> int:
@@ -193,13 +195,17 @@ def _without_strays(piece: Visual) -> Visual:
     return Visual(mesh=kept, color=piece.color)
 
 
-def _both_sides(pieces: list[Visual], scale: float) -> list[Visual]:
-    """Two-sided pieces, scaled; whether a shell is closed is asked of the whole file."""
+def _both_sides(pieces: list[Visual], scale: float, add: bool) -> list[Visual]:
+    """Two-sided pieces, scaled; whether a shell is closed is asked of the whole file.
+
+    Where nothing is to be added (`add`) the file has both sides of what is open.
+    """
     result = []
     offsets = np.cumsum([0, *(len(piece.mesh.vertices) for piece in pieces)])
     stacked = np.concatenate([piece.mesh.vertices for piece in pieces])
     joined = [piece.mesh.faces + start for piece, start in zip(pieces, offsets, strict=False)]
-    faces = two_sided(stacked, np.concatenate(joined))
+    faces = np.concatenate(joined)
+    faces = two_sided(stacked, faces) if add else faces
     for piece, start, end in zip(pieces, offsets[:-1], offsets[1:], strict=True):
         mine = (faces[:, 0] >= start) & (faces[:, 0] < end)
         if not mine.any():

@@ -47,6 +47,56 @@ def test_partnet_mobility(tmp_path: Path):
     assert not list(urdf.parent.rglob("*.txt"))
 
 
+TWO_COLOURS = """mtllib two.mtl
+v 0 0 0
+v 1 0 0
+v 1 1 0
+v 0 1 0
+v 0 0 1
+v 1 0 1
+v 1 1 1
+v 0 1 1
+usemtl red
+f 1 4 3 2
+f 1 2 6 5
+f 2 3 7 6
+usemtl blue
+f 3 4 8 7
+f 4 1 5 8
+f 5 6 7 8
+"""
+"""A closed cube of side 1, three of its sides of another material."""
+CUBES = """<robot name="partnet_2">
+<link name="base"/>
+<link name="link_0"><visual><geometry><mesh filename="two.obj"/></geometry></visual></link>
+<link name="link_1"><visual><origin xyz="-1 0 0"/><geometry><mesh filename="two.obj"/></geometry>
+</visual><visual><geometry><mesh filename="panel.obj"/></geometry></visual></link>
+<joint name="fixed" type="fixed"><parent link="base"/><child link="link_0"/></joint>
+<joint name="hinge" type="revolute"><parent link="link_0"/><child link="link_1"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="1.5" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+def test_a_closed_body_of_several_colours_stays_closed(tmp_path: Path):
+    source = tmp_path / "set" / "7"
+    source.mkdir(parents=True)
+    (source / "two.obj").write_text(TWO_COLOURS)
+    (source / "two.mtl").write_text("newmtl red\nKd 1 0 0\nnewmtl blue\nKd 0 0 1\n")
+    (source / "panel.obj").write_text("v -1 0 0\nv -1 2 0\nv -1 0 2\nf 1 2 3\n")
+    (source / "mobility.urdf").write_text(CUBES)
+    (source / "meta.json").write_text(json.dumps({"model_cat": "Oven"}))
+    (urdf,) = import_set("partnet-mobility", tmp_path / "set", tmp_path / "out").written
+    before = reader.read(source / "mobility.urdf", "oven", root=source)
+    after = reader.read(urdf, "oven", root=urdf.parent)
+    ratio = np.cbrt(np.linalg.det(before.origin.object_T_asset[:3, :3]))
+    for part, area in enumerate((6.0, 6.0 + 2 * 2.0)):  # a panel has two sides
+        assert before.part_mesh(part).area == pytest.approx(area * ratio**2, rel=1e-6)
+        assert after.part_mesh(part).area == pytest.approx(area * ratio**2, rel=1e-6)
+        assert after.part_mesh(part).volume == pytest.approx(ratio**3, rel=1e-6)
+        colours = [{visual.color for visual in obj.visuals[part]} for obj in (before, after)]
+        assert colours[0] == colours[1]
+
+
 PARTNET = {
     "oven": ("oven/101940", "oven"),
     "eyeglasses": ("eyeglasses/101284", "eyeglasses"),
@@ -68,6 +118,7 @@ def test_real_partnet_models_are_the_same_before_and_after(
     before = reader.read(source / "mobility.urdf", name)
     after = reader.read(urdf, name)
     for part in range(len(before.visuals)):
+        assert after.part_mesh(part).area == pytest.approx(before.part_mesh(part).area, rel=1e-4)
         np.testing.assert_allclose(
             after.part_mesh(part).bounds, before.part_mesh(part).bounds, atol=1e-5
         )
