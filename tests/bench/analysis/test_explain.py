@@ -21,7 +21,7 @@ from bench.scoring.evaluate import evaluate
 from bench.scoring.score_files import read_scores
 from bench.scoring.truth import blocks
 from bench.statistics import Interval
-from scapo.store import StoreError, open_split
+from scapo.store import StoreError, open_split, read
 from scapo.store.predictions import write_predictions
 from tests.helpers import made
 from tests.helpers.scoring import root
@@ -237,8 +237,6 @@ def test_a_constant_answer_is_constant(split, tmp_path):
     path = tmp_path / "c.safetensors"
     program.main(["reference", "constant", "--data", str(root(split)), "--category",
                   split.manifest.category, "--out", str(path)])  # fmt: skip
-    from scapo.store import read
-
     arrays, header = read(path)
     assert header["method"] == "constant"
     assert len(np.unique(arrays["part"])) == 1
@@ -249,6 +247,21 @@ def test_a_constant_answer_is_constant(split, tmp_path):
     apart = arrays["joint_pivot"] - centre[:, None]
     direction = apart / np.linalg.norm(apart, axis=-1, keepdims=True)
     np.testing.assert_allclose(direction, direction[:1].repeat(12, 0), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["constant", "oracle-pose"])
+@pytest.mark.parametrize("unknown", [[0, 4], list(range(9))], ids=["some", "all"])
+def test_states_that_are_not_known_are_left_out_of_the_mean(kind, unknown, tmp_path):
+    arrays = made.sample_arrays("eyeglasses", 9, 30)
+    arrays["joint_state"][unknown, 1] = np.nan
+    made.write_split(tmp_path, "eyeglasses", "train", arrays)
+    made.write_split(tmp_path, "eyeglasses", "val", made.sample_arrays("eyeglasses", 4, 30))
+    write_reference(kind, tmp_path, "eyeglasses", tmp_path / "c.safetensors", split="val")
+    state = read(tmp_path / "c.safetensors")[0]["joint_state"]
+    known = np.delete(arrays["joint_state"][:, 1], unknown)
+    second = known.sum() / len(known) if len(known) else np.nan
+    wanted = [arrays["joint_state"][:, 0].sum() / 9, second]
+    np.testing.assert_allclose(state, np.tile(wanted, (4, 1)), rtol=1e-5)
 
 
 def test_the_mean_joint_is_the_joint_where_all_agree(tmp_path):
