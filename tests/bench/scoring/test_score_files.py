@@ -187,3 +187,15 @@ def test_what_unpacks_to_more_than_memory_should_hold_is_refused(scores, monkeyp
     bomb = gzip.compress(b"method,variant\n" + b"0" * (1 << 24))
     scores.write_bytes(bomb)
     assert "more than 1048576 bytes unpacked" in refusal(scores, capsys)
+
+
+def test_no_more_is_written_than_is_read_again(tmp_path, monkeypatch):
+    write(tmp_path / "a.csv.gz")
+    size = len(gzip.decompress((tmp_path / "a.csv.gz").read_bytes()))
+    monkeypatch.setattr(score_files, "MAX_TEXT", size)
+    write(tmp_path / "a.csv.gz")
+    assert len(read_scores(tmp_path / "a.csv.gz")) == 1
+    monkeypatch.setattr(score_files, "MAX_TEXT", size - 1)
+    with pytest.raises(StoreError, match=f"at most {size - 1} bytes of scores, .* sample 2"):
+        write(tmp_path / "b.csv.gz")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv.gz", "a.json"]
