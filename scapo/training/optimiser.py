@@ -57,7 +57,7 @@ class Descent:
             NotFiniteError: Nothing was changed.
         """
         begin_step(self.arithmetic, self.device)
-        optimizer.zero_grad()
+        self.method.zero_grad()  # what an earlier stage left would count in the norm
         terms, total = self._backward(compute)
         said = sum_gradients(self.method, share, total is not None, self.ranks)
         if BAD_LOSS in said or total is None:

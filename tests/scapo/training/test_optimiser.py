@@ -3,19 +3,21 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from scapo.method import Adam, HalfCosine, ParameterGroup, Sgd, Stage, StepDecay
+from scapo.method import Adam, HalfCosine, ParameterGroup, Sgd, Stage, Step, StepDecay
 from scapo.store.checkpoint import TRAINING
 from scapo.store.files import read
 from scapo.training import fit
 from scapo.training.optimiser import learning_rate, make_optimiser, schedule
+from scapo.types import Labels, Observation
 from tests.helpers.tiny import tiny_data
 from tests.helpers.two_ranks import CONFIG, Line, StoppedError, stop_after
 
@@ -76,6 +78,31 @@ class Slid(Line):
                 schedule=StepDecay(every=2, factor=0.1),
             ),
         )
+
+
+class InTurn(Line):
+    """One parameter is trained after the other."""
+
+    def stages(self) -> tuple[Stage, ...]:
+        groups = [(ParameterGroup(module=name),) for name in ("map", "more")]
+        stage = super().stages()[0]
+        return tuple(replace(stage, name=one[0].module, parameters=one) for one in groups)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.more = nn.Linear(1, 1)
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        if step.stage == "map":
+            return super().losses(observation, labels, step)
+        return {"small": 1e-3 * self.more.weight.sum()}
+
+
+def test_the_gradient_of_a_stage_has_nothing_of_the_stage_before(tmp_path: Path) -> None:
+    fit.fit(InTurn(), tiny_data(), tmp_path, CONFIG)
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    second = [line["gradient"] for line in lines if line["stage"] == "more"]
+    assert second == pytest.approx([1e-3] * len(second))
 
 
 class WithoutMomentum(Slid):
