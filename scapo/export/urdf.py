@@ -42,7 +42,7 @@ class Surface:
     """Counter-clockwise seen from outside."""
     color: RGBA = (0.7, 0.7, 0.7, 1.0)
     piece: bool = False
-    """Of a surface that other surfaces close, or that has its reverse beside it where it is open."""
+    """Of a surface that others close, or that has its reverse beside it where it is open."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
