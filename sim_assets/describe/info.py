@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from scapo.store import Split, StoreError
 from scapo.store.files import require
-from scapo.store.manifest import Manifest
+from scapo.store.manifest import Manifest, shards_digest
 from scapo.store.schema import TENSORS
 from scapo.text import one_line
 from sim_assets.sampling.viewpoints import direction_angles
@@ -75,7 +75,7 @@ def _facts(manifest: Manifest) -> list[str]:
         f"{len(manifest.instances)} objects, seed {manifest.seed}",
         f"options    {how}",
         "versions   " + ", ".join(f"{k} {v}" for k, v in sorted(manifest.versions.items())),
-        f"digest     {manifest.digest}",
+        f"digest     {manifest.digest}{_whose(manifest)}",
         f"plan       {manifest.plan_digest}",
     ]
     traits = Counter(instance.trait for instance in manifest.instances if instance.trait)
@@ -91,6 +91,12 @@ def _facts(manifest: Manifest) -> list[str]:
             f"{facts.get('samples_lost', 0):.0f} samples lost"
         )
     return lines
+
+
+def _whose(manifest: Manifest) -> str:
+    """What is to be said of a digest that is not over the shards' hashes, as ours are."""
+    own = manifest.digest == shards_digest(manifest.shards)
+    return "" if own else ", which is not over these shards as this project's are"
 
 
 def histograms(split: Split) -> list[str]:

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 import pytest
 
+from scapo.store import Split
 from sim_assets.__main__ import main
-from sim_assets.describe.info import describe_state, histogram
+from sim_assets.describe.info import describe_split, describe_state, histogram
 from tests.helpers import made
 
 
@@ -51,6 +54,21 @@ def test_tensors_that_no_sample_has_are_damage(name, change, message, tmp_path, 
     assert said.err.count("\n") == 1
     assert "DAMAGED" in said.out
     assert "all whole" not in said.out
+
+
+def test_a_digest_of_other_shards_is_told(tmp_path):
+    """Another writer may have digests of his own; one of ours that is stale names other data."""
+    split = made.make_data(tmp_path, count=4, points=16)
+    shas = "\n".join(shard.sha256 for shard in split.manifest.shards)
+    digest = hashlib.sha256(shas.encode()).hexdigest()
+    path = split.folder / "manifest.json"
+    text = path.read_text()
+    path.write_text(text.replace(split.manifest.digest, digest))
+    assert f"digest     {digest}\n" in describe_split(Split(split.folder)).text
+    path.write_text(text.replace(split.manifest.digest, "0" * 64))
+    told = describe_split(Split(split.folder))
+    assert f"digest     {'0' * 64}, which is not over these shards" in told.text
+    assert told.damage == ""
 
 
 def test_a_damaged_split_costs_itself_alone(tmp_path, capsys):
