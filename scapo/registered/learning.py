@@ -299,7 +299,8 @@ def hinged_as(template: ArticulatedTemplate, said: Placement, found: Placement) 
     if said.pivot is None:
         return found
     apart = rotation_angle(said.rotation, found.rotation)[:, None, None]
-    pivot = torch.where(apart < OTHER_WAY, said.pivot, template.pivots(found))
+    grown = (found.log_scale - said.log_scale).exp()[:, None]  # hinges sit on the base as it is
+    pivot = torch.where(apart < OTHER_WAY, grown * said.pivot, template.pivots(found))
     return replace(found, pivot=pivot)
 
 

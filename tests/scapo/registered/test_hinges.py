@@ -147,3 +147,7 @@ def test_hinges_are_the_networks_where_both_mean_the_same_frame() -> None:
     assert made is not None
     assert_close(made[0], pivot[0])
     assert_close(made[1], shape.pivots(found)[1])
+    larger = replace(found, log_scale=found.log_scale + torch.tensor([0.2, 0.0, -0.1]))
+    grown = hinged_as(shape, replace(said, pivot=pivot), larger).pivot  # they sit on the base
+    assert grown is not None
+    assert_close(grown[0], pivot[0] * torch.tensor([0.2, 0.0, -0.1]).exp())
