@@ -103,9 +103,10 @@ def empty_flag(words: Sequence[str], several: Iterable[str]) -> str | None:
     '--out: expected a value, found none'
     >>> empty_flag(["run", "--only", "--out", "x"], ["--only"])
     '--only: expected a value, found none'
+    >>> empty_flag([], ["--only"])
     """
     listed = set(several)
-    for word, after in zip(words, [*words[1:], "--"], strict=True):
+    for word, after in zip(words, [*words, "--"][1:], strict=True):
         none = not after or word.endswith("=") or (word in listed and after.startswith("--"))
         if word.startswith("--") and none:
             return f"{word.rstrip('=')}: expected a value, found none"
