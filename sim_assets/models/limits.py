@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 
 import numpy as np
 
@@ -36,6 +37,9 @@ had the processor for most of them the asset is refused; else the machine was sl
 read again after the others, for as long as `--timeout` allows."""
 TICK = 0.5
 """Processor seconds between looks at the clock."""
+LOST = ("remove", "__del__")
+"""Functions that Python calls when an object goes, of `weakref` and destructors: what is raised in
+them is lost, with a warning."""
 
 
 class _TooLongError(BaseException):
@@ -101,8 +105,9 @@ def _timed() -> Iterator[Callable[[], bool]]:
         yield is_late
         return
 
-    def look(*_: object) -> None:
-        if is_late() and getattr(_bounded, "active", False):
+    def look(_: int, frame: FrameType | None) -> None:
+        lost = frame is not None and frame.f_code.co_name in LOST  # the next tick is elsewhere
+        if is_late() and not lost and getattr(_bounded, "active", False):
             raise _TooLongError
 
     before = signal.signal(signal.SIGPROF, look)

@@ -117,6 +117,24 @@ def test_time_is_the_processors_and_swallowed_errors_count(monkeypatch):
     assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
 
 
+def test_nothing_is_raised_where_python_would_lose_it(monkeypatch):
+    monkeypatch.setattr(limits, "READ_SECONDS", 0.1)
+    monkeypatch.setattr(limits, "TICK", 0.02)
+
+    class Gone:
+        def __del__(self) -> None:
+            until = time.thread_time() + 0.3
+            while time.thread_time() < until:
+                pass
+
+    def read() -> None:
+        Gone()
+        sum(range(10**8))
+
+    with pytest.raises(AssetError, match=r"read in 0\.1 s"), bounded(Path("a")):
+        read()
+
+
 def test_memory_is_bounded_and_given_back():
     before = resource.getrlimit(resource.RLIMIT_AS)
     match = "a: expected to be read in 64 MiB of memory, found MemoryError"
