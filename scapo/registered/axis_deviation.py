@@ -168,7 +168,7 @@ def deviating_templates(
     """
     views, placement = start.inliers.views, start.inliers.placement
     thin, observed = _made_thin(start.template, views, placement, generator)
-    rests = _rests(limits_of(placement.state, start.template.kinds))
+    rests = _rests(limits_of(placement.state, thin.kinds), _senses(thin) if parallel else None)
     own, jobs = own_generators(generator, len(rests)), list[Callable[[], Candidate]]()
     for ends, one in zip(rests, own, strict=True):
         span = _span(thin) if parallel else None
@@ -198,14 +198,30 @@ def _made_thin(
     return thin, observe_part_rotations(thin, views, placement, REACHES, poses)
 
 
-def _rests(limits: JointLimits) -> list[Float[Tensor, "J R"]]:
-    """Rests to choose from: beyond either end of each hinge's states, in all combinations."""
+def _senses(template: ArticulatedTemplate) -> list[bool]:
+    """Of each of several parallel hinges, whether its axis has the sense of the first."""
+    axes = template.directions().detach()
+    return (axes @ axes[0] > 0).tolist()
+
+
+def _rests(limits: JointLimits, senses: list[bool] | None = None) -> list[Float[Tensor, "J R"]]:
+    """Rests to choose from: beyond either end of each hinge's states, in all combinations.
+
+    Args:
+        limits: Of the states.
+        senses: Where hinges are parallel, `_senses`: their parts are taken for each other's mirror
+            images, which turn in opposite senses, and rest where these do.
+    """
     low, high, wide = limits.low, limits.high, limits.wider(OUTWARDS)
     beyond = [
         [torch.linspace(float(a), float(b), RESTS) for a, b in pairs]
         for pairs in (zip(low, wide.low, strict=True), zip(high, wide.high, strict=True))
     ]
-    sides = product((0, 1), repeat=len(low))
+    sides = list(product((0, 1), repeat=len(low)))
+    if senses is not None:
+        alike = [False, *senses[1:]]  # the first has its own end
+        sides = [ends for ends in sides if all((end != ends[0]) == same
+                 for end, same in zip(ends, alike, strict=True))]  # fmt: skip
     return [torch.stack([beyond[end][j] for j, end in enumerate(ends)]) for ends in sides]
 
 

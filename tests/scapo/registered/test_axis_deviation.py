@@ -19,6 +19,8 @@ from scapo.registered.axis_deviation import (
     LEAST_GAIN_PARALLEL,
     REACHES,
     _parallel,
+    _rests,
+    _senses,
     deviating_templates,
     observe_part_rotations,
     refine_deviations,
@@ -30,6 +32,7 @@ from scapo.registered.axis_deviation import (
 from scapo.registered.bundle_adjustment import Candidate, FitOptions, Inliers
 from scapo.registered.config import DiscoveryConfig
 from scapo.registered.deviation_model import DeviationModel
+from scapo.registered.joint_limits import limits_of
 from scapo.registered.pose_search import SearchResult
 from scapo.registered.template import ArticulatedTemplate, Placement, across_axis
 from tests.helpers.sighted import sighted, template
@@ -115,6 +118,18 @@ def test_hinges_along_one_direction_are_parallel_whatever_their_sense() -> None:
     made.axis.data = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
     assert not _parallel(made)
     assert not _parallel(ArticulatedTemplate(("revolute", "prismatic"), 8))
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_parallel_hinges_rest_as_mirror_images_do(sense: float) -> None:
+    """A part and its mirror image turn in opposite senses: about one axis or about two."""
+    made = ArticulatedTemplate(("revolute", "revolute"), 8)
+    made.axis.data = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, sense]])
+    limits = limits_of(torch.tensor([[-0.5, 0.2], [0.5, 1.2]]), made.kinds)
+    rests = _rests(limits, _senses(made))
+    ends = [(one[:, 0] > limits.low + 0.5).tolist() for one in rests]
+    assert ends == ([[False, True], [True, False]] if sense > 0 else [[False] * 2, [True] * 2])
+    assert len(_rests(limits)) == 4
 
 
 def test_parallel_hinges_stay_so_when_a_fit_has_turned_their_axes(
