@@ -15,7 +15,9 @@ from scapo.geometry.points import normalise, squared_distances
 from scapo.geometry.rigid import invert, random_rotations, rotation_angle
 from scapo.method import Mode, Step, evenly
 from scapo.registered import base
+from scapo.registered import method as registered
 from scapo.registered.base import AbstractRegistered
+from scapo.registered.bundle_adjustment import Candidate
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.decode import nearest_weights
 from scapo.registered.learning import Said, SeenClouds, learned_row
@@ -381,3 +383,67 @@ def test_a_start_puts_hinges_whose_axes_deviate_where_the_parts_touch():
     placed = method.template.place(method.pseudo.placement())[0]
     first = template()
     assert (placed - first.place(truth)[0]).norm(dim=-1).max() < 0.02
+
+
+def two_flaps(learned: bool) -> tuple[TemplateRegistration, Tensor]:
+    """Eyeglasses whose hinges do not deviate, and 40 clouds; of the second hinge no point."""
+    views, truth = sighted(40, seed=61)
+    one = template()
+    discovery = DiscoveryConfig(final_points=400)
+    config = RegisteredConfig(points=128, channels=8, learned=24, discovery=discovery)
+    method = TemplateRegistration(config, CATEGORIES["eyeglasses"], generator(0))
+    with torch.no_grad():
+        method.template.assign(one.points, one.normals, torch.cat([one.logit, one.logit[:, :1]], 1))
+        method.template.axis.copy_(one.axis.expand(2, 3))
+        method.template.pivot.copy_(one.pivot.expand(2, 3))
+    both = replace(truth, state=truth.state.repeat(1, 2), shift=truth.shift.repeat(1, 2, 1))
+    camera = (truth.rotation.mT @ (views.camera - truth.translation)[..., None])[..., 0]
+    method.pseudo.set(views.points[:, 0], both, camera, torch.ones(40))
+    method.pseudo.show(ShownPoints.of(views))
+    assert isinstance(method.network, ViewNetwork)
+    method.network.learned.fill_(float(learned))
+    return method.eval(), views.points - views.camera[:, None]
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_once_the_network_helps_to_place_clouds_two_hinges_are_asked_again_whether_they_deviate(
+    again: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method, cloud = two_flaps(learned=True)
+    asked = list[tuple[int, int]]()
+
+    def leaning(start: Candidate, judges: PartialViews, *_: object) -> Candidate:
+        asked.append((len(start.inliers.views.points), len(judges.points)))
+        made = start.template.with_points(400)
+        made.load.fill_(0.1 if again else 0.0)
+        return replace(start, template=made)
+
+    monkeypatch.setattr(registered, "with_axis_deviation", leaning)
+    monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
+    for _ in range(2):  # the second time it deviates already, or is asked in vain again
+        method._place(cloud, Labels(), generator(0))
+    assert asked == [(18, 10)] * (1 if again else 2)  # a quarter judges, three fifths of the others
+    assert method.template.deviates() == again
+    assert len(method.pseudo.state) == (24 if again else 40)  # views are placed anew
+
+
+@pytest.mark.parametrize(
+    "why", ["nothing learned", "hinges alone are taught", "no axis may lean", "one hinge"]
+)
+def test_hinges_are_not_asked_again_where(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    method, cloud = two_flaps(learned=why != "nothing learned")
+    if why == "hinges alone are taught":
+        told = replace(method.config, start="a run", supervision=("instance",))
+        method.config = replace(told, teach="hinges")
+    if why == "no axis may lean":
+        discovery = replace(method.config.discovery, leans=False)
+        method.config = replace(method.config, discovery=discovery)
+    if why == "one hinge":
+        method = trained(steps=0)[0]
+
+    def unasked(*_: object) -> None:
+        raise AssertionError("asked")
+
+    monkeypatch.setattr(TemplateRegistration, "_ask_deviation", unasked)
+    monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
+    method._place(cloud, Labels(), generator(0))
