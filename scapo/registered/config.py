@@ -92,6 +92,9 @@ class DiscoveryConfig(TemplateConfig):
     together: bool = True
     """Count what the views of all known objects say among the votes of each; where a symmetry
     exchanges parts objects are read in two ways, and each votes alone."""
+    standing: bool = True
+    """Learn how objects stand, and charge hypotheses by it, where the network learns candidates
+    that stand as their objects do. Elsewhere its word and the loss tell better."""
 
     def __post_init__(self) -> None:
         """Raise ValueError where the dense template would never be built, or the grid is coarse."""
@@ -200,7 +203,8 @@ def decided(config: RegisteredConfig, category: Category) -> RegisteredConfig:
     if price is None:
         price = OBJECTS_DISSENT if stand == "objects" else DISSENT
     together = config.discovery.together and category.symmetry is None
-    discovery = replace(config.discovery, together=together)
+    standing = config.discovery.standing and stand == "objects"
+    discovery = replace(config.discovery, together=together, standing=standing)
     return replace(config, stand=stand, dissent=price, discovery=discovery)
 
 

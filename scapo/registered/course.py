@@ -86,7 +86,7 @@ def plan_of(
     plan["dense template"] = DENSE * config.dense_rounds
     if config.leans and "revolute" in kinds:
         plan["deviating axes"] = DEVIATION
-    if objects:
+    if objects and config.standing:
         plan["search of objects"] = VIEW * ASKED
         plan["how objects stand"] = STANDING
     plan["search of all views"] = VIEW * views

@@ -109,7 +109,7 @@ def discover(
     inliers = best.inliers
     placement = cut_by_mirror(best.template, inliers.placement)
     best = replace(best, inliers=replace(inliers, placement=placement))
-    scorer = _how_objects_stand(best, shown, course) if shown else None
+    scorer = _how_objects_stand(best, shown, course) if shown and config.standing else None
     searching = partial(search_views, best, views, scorer, journal)
     found = course.step("search of all views", searching)
     return Discovery(template=best.template, found=found, scorer=scorer)

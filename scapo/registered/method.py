@@ -279,6 +279,11 @@ class TemplateRegistration(AbstractRegistered):
                 logger.warning("too few clouds of any one object: which show the same is not used")
         return discover(learned.views, kinds, config, generator, objects, self.journal)
 
+    def _learn_orientation(self, views: PartialViews, made: Discovery, seed: Tensor) -> None:
+        """Where the network learns what stands as its object does."""
+        if self.config.discovery.standing:
+            super()._learn_orientation(views, made, seed)
+
     def _trusted(
         self, found: Candidates, cloud: Tensor, labels: Labels, generator: torch.Generator
     ) -> tuple[Candidates, Float[Tensor, " B"]]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -41,7 +41,9 @@ def test_objects_say_how_views_stand_where_a_part_slides_and_they_are_known(
     config = RegisteredConfig(supervision=("instance",) if told else ())
     found = decided(config, CATEGORIES[category])
     assert (found.stand, found.dissent) == (stand, price)
-    asked = RegisteredConfig(supervision=config.supervision, stand="views", dissent=0.3)
+    assert found.discovery.standing == (stand == "objects")  # nothing else asks a scorer
+    discovery = DiscoveryConfig(standing=False)
+    asked = replace(config, stand="views", dissent=0.3, discovery=discovery)
     assert decided(asked, CATEGORIES[category]) == asked
 
 

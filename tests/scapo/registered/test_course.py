@@ -116,16 +116,16 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def discovered(journal: Journal, objects: int, config: DiscoveryConfig = FEW) -> torch.Tensor:
     views, _ = shown()
     found = discovery.discover(views, KINDS, config, generator(3), [views] * objects, journal)
-    assert (found.scorer is None) == (objects == 0)
+    assert (found.scorer is None) == (objects == 0 or not config.standing)
     return found.template.pivot.detach()
 
 
 @pytest.mark.parametrize("objects", [0, 6])
-@pytest.mark.parametrize("mirror", [True, False])
+@pytest.mark.parametrize(("mirror", "standing"), [(True, True), (False, True), (True, False)])
 def test_the_plan_names_the_steps_that_are_taken(
-    light: list[str], objects: int, mirror: bool
+    light: list[str], objects: int, mirror: bool, standing: bool
 ) -> None:
-    journal, config = Told(), replace(FEW, mirror=mirror)
+    journal, config = Told(), replace(FEW, mirror=mirror, standing=standing)
     discovered(journal, objects, config)
     plan = plan_of(config, KINDS, 16, objects)
     assert [words for words, _, _ in journal.lines] == list(plan)
