@@ -166,8 +166,9 @@ def deviating_templates(
     Returns:
         Templates with the same views; none where the axes deviate too little.
     """
-    views, placement = start.inliers.views, start.inliers.placement
-    thin, observed = _made_thin(start.template, views, placement, generator)
+    views, thin = start.inliers.views, start.template.with_points(len(start.template.points))
+    placement = seat_hinges(thin, start.inliers.placement)
+    observed = _made_thin(thin, views, placement, generator)
     rests = _rests(limits_of(placement.state, thin.kinds), _senses(thin) if parallel else None)
     own, jobs = own_generators(generator, len(rests)), list[Callable[[], Candidate]]()
     for ends, one in zip(rests, own, strict=True):
@@ -183,19 +184,18 @@ def deviating_templates(
 
 
 def _made_thin(
-    template: ArticulatedTemplate,
+    thin: ArticulatedTemplate,
     views: PartialViews,
     placement: Placement,
     generator: torch.Generator,
-) -> tuple[ArticulatedTemplate, PartRotations]:
-    """A template whose parts are built from rotated views, and the rotations against it."""
-    thin, poses = template.with_points(len(template.points)), None
-    seat_hinges(thin)
+) -> PartRotations:
+    """Builds a template's parts, in place, from rotated views; the rotations against it."""
+    poses = None
     for reach in FANNED:
         observed = observe_part_rotations(thin, views, placement, (reach,), poses)
         poses = rotated_poses(thin, placement, observed)
         rebuild(thin, views, placement, poses=poses, settled=True, generator=generator)
-    return thin, observe_part_rotations(thin, views, placement, REACHES, poses)
+    return observe_part_rotations(thin, views, placement, REACHES, poses)
 
 
 def _senses(template: ArticulatedTemplate) -> list[bool]:

@@ -223,7 +223,7 @@ def bundle_adjust(
         The placements and the loss of each view at the last step.
     """
     if not template.deviates():
-        seat_hinges(template)
+        start = seat_hinges(template, start)
     free = _Free(start, template)
     optimiser = torch.optim.Adam([*free.groups, *_shared(template)], betas=BETAS)
     rates = [group["lr"] for group in optimiser.param_groups]

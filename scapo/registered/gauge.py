@@ -118,21 +118,30 @@ def choose_axes(
 
 
 @torch.no_grad()
-def seat_hinges(template: ArticulatedTemplate) -> None:
+def seat_hinges(template: ArticulatedTemplate, placement: Placement) -> Placement:
     """Slide each hinge's pivot along its axis to where its part comes near it; axes of length 1.
 
-    In place. The placed parts do not care, but fits do: about a pivot far from its part an axis
-    cannot turn without moving the part, and a step turns a long axis little. Where axes deviate
-    from object to object they turn about the pivot.
+    In place. Fits care where it is: about a pivot far from its part an axis cannot turn without
+    moving the part, and a step turns a long axis little. Where axes deviate from object to object
+    they turn about the pivot.
+
+    Returns:
+        The placements, where no part has moved: an object that is not as large along all directions
+        of the frame takes a pivot aside that slides along an axis askew to them.
     """
-    part = template.logit.argmax(-1)
+    part, scale = template.logit.argmax(-1), placement.log_scale.exp()
+    turns, shift = template.turns(placement), placement.shift.clone()
     for j, axis in enumerate(template.directions()):
         template.axis[j] = axis
         arm = template.points[part == j + 1] - template.pivot[j]
         if len(arm) and template.kinds[j] == "revolute":
             along = arm @ axis
             away = (arm - along[:, None] * axis).norm(dim=-1)
-            template.pivot[j] += axis * along[away <= away.quantile(SEAT)].median()
+            slid = axis * along[away <= away.quantile(SEAT)].median()
+            template.pivot[j] += slid
+            moved = scale * slid
+            shift[:, j] -= moved - (turns[:, j] @ moved[..., None])[..., 0]
+    return replace(placement, shift=shift)
 
 
 @torch.no_grad()

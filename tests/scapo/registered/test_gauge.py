@@ -219,7 +219,22 @@ def test_pivots_slide_to_their_part_and_axes_have_length_one() -> None:
     with torch.no_grad():
         made.pivot[0, 1] += 0.7
         made.axis[0] *= 8
-    seat_hinges(made)
+    seat_hinges(made, placements(3))
     assert made.pivot[0, 1].abs() < 0.1
     assert_close(made.pivot[0, [0, 2]].detach(), torch.tensor([-0.2, -0.15]))
     assert_close(made.axis[0].norm().detach(), torch.tensor(1.0))
+
+
+@pytest.mark.parametrize("axis", [[0.0, 1.0, 0.0], [0.5, 1.0, 0.3]])
+def test_no_part_moves_where_pivots_slide(axis: list[float]) -> None:
+    made, placement = plates(1.3), hinged_elsewhere(40, 8)  # of all sizes
+    along = torch.nn.functional.normalize(torch.tensor(axis), dim=0)
+    with torch.no_grad():
+        made.axis[0] = along
+        made.pivot[0] += 0.7 * along
+    shift = placement.shift - (placement.shift @ along)[..., None] * along
+    placement = replace(placement, shift=shift)
+    before, _ = made.place(placement)
+    found = seat_hinges(made, placement)
+    assert_close(made.place(found)[0], before, atol=1e-5, rtol=0)
+    assert_close(found.shift @ along, torch.zeros(40, 1), atol=1e-6, rtol=0)
