@@ -50,6 +50,9 @@ ALIKE, SAME_SIDE = 4, 0.9
 within which their cameras are."""
 UNLIKE, UNLIKE_WEIGHT = 20.0, 1 / 60
 """Squared distance of images that have nothing in common, and the loss that counts as one."""
+TOLD_BY, SAME = 3, 1e-4
+"""Points by whose distances from the middle a view is known again, and normalised length up to
+which these are the same."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +74,8 @@ class ViewBank:
     """1 for each prismatic joint, 0 for the others."""
     front: Float[Tensor, "3 3"]
     """Turns the mean direction to the cameras to -z, far from where `look` has no roll."""
-    key: Float[Tensor, "V 3"] | None = None
-    """The first point of each placed view, so that none is compared with itself."""
+    key: Float[Tensor, "V K"] | None = None
+    """`_key` of each placed view, so that none is compared with itself."""
 
     @staticmethod
     @torch.no_grad()
@@ -142,7 +145,7 @@ class ViewBank:
             modes=placement,
             slides=template.sliding,
             front=front,
-            key=shown.points[:, 0],
+            key=_key(shown.points),
         )
 
     @torch.no_grad()
@@ -242,7 +245,8 @@ class ViewBank:
         apart = self.distances(image).amin(-1).clamp_max(UNLIKE)
         away = (direction @ -self.look[:, 2].mT) < SAME_SIDE
         if self.key is not None:
-            away = away | (views.points[:, :1] == self.key).all(-1)[:, None]
+            gap = (_key(views.points)[:, None] - self.key).abs().amax(-1)  # (B, V)
+            away = away | (gap < SAME)[:, None]
         apart = torch.where(away, UNLIKE, apart)
         count = min(ALIKE, apart.shape[-1])
         return UNLIKE_WEIGHT * apart.topk(count, largest=False).values.mean(-1)
@@ -268,6 +272,11 @@ class ShownPoints:
         seen = self.points - middle[:, None]
         radius = seen.norm(dim=-1).mean(-1).clamp_min(TINY)
         return middle, seen * (MEAN_RADIUS / radius)[:, None, None], radius
+
+
+def _key(points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B K"]:
+    """Tells views apart however they are turned: frames of clouds turn with what is looked at."""
+    return points[:, :TOLD_BY].norm(dim=-1)
 
 
 def _drawn(

@@ -11,7 +11,7 @@ import torch
 from scapo.geometry.points import MEAN_RADIUS
 from scapo.geometry.rigid import random_rotations, rotation_angle
 from scapo.records import cat, take
-from scapo.registered.template import ArticulatedTemplate, Placement
+from scapo.registered.template import ArticulatedTemplate, Placement, turn_placement
 from scapo.registered.view_bank import (
     CELLS,
     DEPTH_WEIGHT,
@@ -184,13 +184,23 @@ def test_placed_views_propose_and_tell_what_is_like_them():
     assert odd.max() <= UNLIKE * UNLIKE_WEIGHT + 1e-6
 
 
-def test_a_placed_view_is_not_compared_with_itself():
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_placed_view_is_not_compared_with_itself(turned: bool):
     views, truth = sighted(2, seed=46)
     camera = (truth.rotation.mT @ views.direction()[..., None])[..., 0]
     alone = take(truth, torch.tensor([0]))
     bank = ViewBank.placed(
         template(), ShownPoints.of(take(views, torch.tensor([0]))), alone, camera[:1]
     )
+    if turned:  # as clouds are looked at in frames of their own
+        turn = random_rotations(2, generator(47))
+        truth = turn_placement(truth, turn)
+        views = replace(
+            views,
+            points=views.points @ turn.mT,
+            normals=views.normals @ turn.mT,
+            camera=(turn @ views.camera[..., None])[..., 0],
+        )
     odd = bank.unlikeness(views, truth.rotation[:, None])
     assert odd[0, 0].item() == pytest.approx(UNLIKE * UNLIKE_WEIGHT)
     stranger = replace(bank, key=None).unlikeness(views, truth.rotation[:, None])
