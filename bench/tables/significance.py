@@ -22,6 +22,8 @@ COLUMNS = (
     "data", "category", "metric", "unit", "first", "second", "difference", "low", "high",
     "p_value", "samples",
 )  # fmt: skip
+COMPARED = (*((measure.metric, measure.unit) for measure in TABLE_1), ("joint_state", "m"))
+"""Metric and unit; a joint has its state in degrees, or in metres where it slides."""
 
 
 def significance_csv(results: Results, rule: ApRule = "mean") -> str:
@@ -57,14 +59,13 @@ def _compared(
     first: Sequence[Scores], second: Sequence[Scores], rule: ApRule
 ) -> Iterator[tuple[str, str, Paired]]:
     instance = first[0].instance
-    for measure in TABLE_1:
-        key = (measure.metric, measure.unit)
+    for key in COMPARED:
         values = [
             _per_sample([run.errors[key] for run in runs if key in run.errors])
             for runs in (first, second)
         ]
         if values[0] is not None and values[1] is not None:
-            yield measure.metric, measure.unit, paired(values[0], values[1], instance)
+            yield *key, paired(values[0], values[1], instance)
     counted = [[passes(run.errors, rule) for run in runs] for runs in (first, second)]
     for name in counted[0][0]:
         values = [

@@ -27,7 +27,7 @@ def make_scores(
         ("joint_direction", "deg"): quality * generator.gamma(2, 3, size=(samples, parts - 1)),
         ("joint_pivot", "r4"): metres[:, 1:] * 3,
         ("joint_pivot", "m"): metres[:, 1:],
-        ("joint_state", "deg"): generator.gamma(2, 3, size=(samples, parts - 1)),
+        **_states(generator.gamma(2, 3, size=(samples, parts - 1)), category == "drawer"),
         ("part_rotation", "deg"): quality * generator.gamma(2, 4, size=(samples, parts)),
         ("part_translation", "r4"): metres * 3,
         ("part_translation", "m"): metres,
@@ -50,6 +50,13 @@ def make_scores(
         known = {name: value for name, value in own.items() if value is not None}
         file.report = report_of(run, supervision, samples) | known
     return errors
+
+
+def _states(error, slides):
+    """In degrees, or in 4 x mean radii and metres."""
+    if slides:
+        return {("joint_state", "r4"): error * 0.03, ("joint_state", "m"): error * 0.01}
+    return {("joint_state", "deg"): error}
 
 
 def report_of(run, supervision=(), samples=SAMPLES):

@@ -243,6 +243,18 @@ def test_significance(scores, tmp_path):
     assert int(row["samples"]) == SAMPLES
 
 
+def test_states_of_joints_that_slide_are_compared_in_metres(tmp_path):
+    first, second = (
+        make_scores(tmp_path, method, "drawer", kind="sensor")["joint_state", "m"]
+        for method in ("icp", "scapo")
+    )
+    rows = csv.DictReader(significance_csv(load(tmp_path)).splitlines())
+    (row,) = [row for row in rows if row["metric"] == "joint_state"]
+    assert row["unit"] == "m"
+    assert float(row["difference"]) == pytest.approx((second - first).mean(), rel=1e-5)
+    assert int(row["samples"]) == SAMPLES
+
+
 def test_latex_compiles_and_golden(scores, tmp_path, repository, update_golden):
     table = tables.table_3(Results([]), printed_cells())
     golden = repository / "tests" / "golden" / "table3.tex"
