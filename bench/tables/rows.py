@@ -260,12 +260,18 @@ def budget_notes(results: Results, kind: Kind, categories: Sequence[str]) -> tup
 def _answered(counts: Counts) -> str:
     """Samples, and how many have every answer: what others lack is in no mean, but fails the AP.
 
+    Where more lack one tensor than another, they need not be the same samples.
+
     >>> _answered(Counts(samples=1000, instances=50, unanswered={"part_weight": 700}))
     '1000 samples, 300 of them answered'
+    >>> _answered(Counts(samples=9, instances=3, unanswered={"joint_axis": 2, "part_weight": 1}))
+    '9 samples, at most 7 of them answered'
     """
-    none = max(counts.unanswered.values(), default=0)
-    more = f", {counts.samples - none} of them answered" if none else ""
-    return f"{counts.samples} samples{more}"
+    lacking = set(counts.unanswered.values())
+    if not lacking:
+        return f"{counts.samples} samples"
+    most = "at most " if len(lacking) > 1 else ""
+    return f"{counts.samples} samples, {most}{counts.samples - max(lacking)} of them answered"
 
 
 TOLD = ("device", "processor", "batch", "seconds_per_cloud")
