@@ -8,6 +8,7 @@ lie there too and is not looked at.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,6 +34,8 @@ FIELD_OF_VIEW = (5.0, 170.0)
 """Degrees, of either side of an image."""
 MOST_STRETCH = 1.5
 """Of fx and fy: pixels are about square."""
+OPENCV = re.compile(r"\A%YAML:.*|!!opencv-[\w-]+")
+"""What its FileStorage writes beside YAML."""
 MATRICES = ("K", "k", "cam_K", "camera_matrix", "intrinsic_matrix", "intrinsics")
 
 
@@ -148,7 +151,9 @@ def read_mask(path: Path, shape: tuple[int, ...]) -> Bool[np.ndarray, "H W"]:
             f"{path}: expected a mask of the depth image's size, {shape[1]} x {shape[0]}, found "
             f"{values.shape[1]} x {values.shape[0]}"
         )
-    return np.asarray(values if values.ndim == 2 else values[..., :3].any(-1), bool)
+    if values.ndim == 3:
+        values = values[..., : 1 if values.shape[-1] == 2 else 3].any(-1)  # grey with alpha, RGB(A)
+    return np.asarray(values, bool)
 
 
 def read_intrinsics(text: str, width: int, height: int) -> Intrinsics:
@@ -196,7 +201,8 @@ def _from_file(path: Path) -> tuple[float, ...]:
     if not path.is_file():
         raise InputError(f"--intrinsics {path}: expected fx,fy,cx,cy or a file, found neither")
     try:
-        record = yaml.safe_load(path.read_text(encoding="utf-8")[: 1 << 20])
+        text = path.read_text(encoding="utf-8")[: 1 << 20]
+        record = yaml.safe_load(OPENCV.sub("", text))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON or YAML, found {_problem(error)}") from error
     named = cast("Mapping[str, Any]", record) if isinstance(record, Mapping) else {}

@@ -12,7 +12,13 @@ import pytest
 from PIL import Image
 
 from bench.infer.cloud import InputError
-from bench.infer.depth import companions, depth_in_metres, read_depth, read_intrinsics
+from bench.infer.depth import (
+    companions,
+    depth_in_metres,
+    read_depth,
+    read_intrinsics,
+    read_mask,
+)
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = "60,62,33,23.5"
@@ -44,6 +50,19 @@ def test_points_project_to_their_pixels_at_their_depth(image):
     np.testing.assert_allclose(twice.points, 2 * cloud.points, rtol=1e-5)
 
 
+@pytest.mark.parametrize("bands", ["L", "LA", "RGB", "RGBA"])
+def test_a_mask_is_read_from_colours_and_greys_but_not_from_transparency(bands, image):
+    path, mask, _, shown = image
+    picture = Image.open(mask).convert(bands.rstrip("A"))
+    if bands.endswith("A"):
+        picture.putalpha(255)
+    picture.save(mask)
+    np.testing.assert_array_equal(read_mask(mask, (HEIGHT, WIDTH)), shown)
+    assert len(read_depth(path, CAMERA, mask, None).points) == np.count_nonzero(
+        shown & (depth_in_metres(path, None) > 0)
+    )
+
+
 def test_floats_are_metres(image, tmp_path):
     path, mask, depth, _ = image
     floats = np.where(depth > 0, depth, np.nan).astype(np.float32)
@@ -72,9 +91,25 @@ def test_cameras_are_read_as_calibrations_write_them(record, tmp_path):
     assert read_intrinsics(str(path), WIDTH, HEIGHT) == wanted
 
 
-def test_yaml_is_read_too(tmp_path):
+OPENCV = """%YAML:1.0
+---
+image_width: 64
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 60., 0., 33., 0., 62., 2.35e+01, 0., 0., 1. ]
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["image_width: 64\ncamera_matrix:\n  data: [60, 0, 33, 0, 62, 23.5, 0, 0, 1]\n", OPENCV],
+    ids=["ROS", "OpenCV"],
+)
+def test_yaml_is_read_too(text, tmp_path):
     path = tmp_path / "camera.yaml"
-    path.write_text("image_width: 64\ncamera_matrix:\n  data: [60, 0, 33, 0, 62, 23.5, 0, 0, 1]\n")
+    path.write_text(text)
     assert read_intrinsics(str(path), WIDTH, HEIGHT).row()[:4] == (60, 62, 33, 23.5)
 
 
