@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scapo.store import Split, StoreError
-from scapo.store.files import require
+from scapo.store.files import require, tensor_names
 from scapo.store.manifest import Manifest, shards_digest
 from scapo.store.schema import TENSORS
 from scapo.text import one_line
@@ -102,7 +102,8 @@ def _whose(manifest: Manifest) -> str:
 def histograms(split: Split) -> list[str]:
     """One line each for joint states, views, and the parts' share of points."""
     manifest = split.manifest
-    data = split.arrays("part", "camera_T_part", "joint_state", "visible", "instance")
+    known = "part", "camera_T_part", "joint_state", "visible", "instance"
+    data = split.arrays(*known, *(("sensor",) if _in_another_frame(split) else ()))
     lines = []
     for j, joint in enumerate(manifest.joints):
         turning = joint.kind == "revolute"
@@ -110,7 +111,8 @@ def histograms(split: Split) -> list[str]:
         values, unit = (np.degrees(state), "deg") if turning else (state, "m")
         lines.append(histogram(f"joint {j}", values, unit))
     pose = data["camera_T_part"][:, 0].astype(np.float64)
-    eye = -(pose[:, :3, :3].transpose(0, 2, 1) @ pose[:, :3, 3:])[..., 0]
+    away = data.get("sensor", 0.0) - pose[:, :3, 3]
+    eye = (pose[:, :3, :3].transpose(0, 2, 1) @ away[..., None])[..., 0]
     angles = direction_angles(eye)
     lines.append(histogram("azimuth", angles[:, 0], "deg"))
     lines.append(histogram("elevation", angles[:, 1], "deg"))
@@ -125,6 +127,12 @@ def histograms(split: Split) -> list[str]:
     per_object = np.bincount(data["instance"], minlength=len(manifest.instances))
     lines.append(f"per object {per_object.min()} to {per_object.max()} samples")
     return lines
+
+
+def _in_another_frame(split: Split) -> bool:
+    """Whether clouds are not in their cameras' frames, whose centres the split then has."""
+    shards = split.manifest.shards
+    return bool(shards) and "sensor" in tensor_names(split.folder / shards[0].file)
 
 
 def _ambiguous(split: Split) -> str:

@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 import hashlib
+import re
 
 import numpy as np
 import pytest
 
 from scapo.store import Split
 from sim_assets.__main__ import main
-from sim_assets.describe.info import describe_split, describe_state, histogram
+from sim_assets.describe.info import describe_split, describe_state, histogram, histograms
 from tests.helpers import made
+
+VIEWS = ("azimuth", "elevation", "distance")
+NUMBER = re.compile(r"-?[\d.]+")
 
 
 def test_a_histogram_in_one_line():
@@ -27,6 +31,27 @@ def test_states_in_words():
     assert describe_state(np.pi / 2, "revolute") == "90°"
     assert describe_state(0.123, "prismatic") == "12 cm"
     assert describe_state(float("nan"), "revolute") == "–"
+
+
+def test_views_are_told_of_clouds_that_are_not_in_the_cameras_frame(tmp_path):
+    """The same views, moved with their cameras."""
+    arrays = made.sample_arrays("laptop", 6, 16)
+    motion = np.eye(4, dtype=np.float32)
+    motion[:3, :3] = made.rotations(np.random.default_rng(1), 1)[0]
+    motion[:3, 3] = 3, -1, 7
+    there = dict(arrays)
+    there["camera_T_part"] = motion @ arrays["camera_T_part"]
+    there["sensor"] = np.tile(motion[:3, 3], (6, 1))
+    told = [
+        histograms(made.write_split(tmp_path / name, "laptop", "test", one))
+        for name, one in (("here", arrays), ("there", there))
+    ]
+    here, there = (
+        [float(x) for line in lines if line.startswith(VIEWS) for x in NUMBER.findall(line)]
+        for lines in told
+    )
+    assert len(here) == 3 * len(VIEWS)
+    assert there == pytest.approx(here, abs=0.1)
 
 
 @pytest.mark.parametrize(
