@@ -20,15 +20,17 @@ CHECKOUT = Path("results", "checkpoints")
 def find(path_or_category: str | Path) -> Path:
     """The checkpoint's path.
 
+    A folder without one, such as a category's clouds, hides no released model of its name.
+
     Raises:
         StoreError: Nothing of that name.
     """
-    path = Path(path_or_category)
-    if path.exists():
+    path, there = Path(path_or_category), weights()
+    named = there.get(str(path_or_category))
+    if path.exists() and (named is None or path.is_file() or any(path.glob("*.safetensors"))):
         return path
-    there = weights()
-    if str(path_or_category) in there:
-        return there[str(path_or_category)]
+    if named is not None:
+        return named
     known = ", ".join(there) or "none yet"
     raise StoreError(
         f"{path_or_category}: expected a run folder, a checkpoint or a category with released "

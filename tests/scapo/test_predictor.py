@@ -21,7 +21,7 @@ from scapo.predictor import Predictor, load
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.method import TemplateRegistration
 from scapo.registry import LIBRARY
-from scapo.released import released
+from scapo.released import find, released
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, with_alignment, write_checkpoint
 from scapo.store.schema import StoreError
 from scapo.types import Observation, Prediction
@@ -194,6 +194,16 @@ def test_a_misspelt_category_is_told_the_one_that_looks_like_it(monkeypatch) -> 
     monkeypatch.setattr("scapo.released.weights", lambda: {"oven": Path(), "laptop": Path()})
     with pytest.raises(StoreError, match=r"\(oven, laptop\), found none; did you mean 'oven'\?$"):
         load("oevn")
+
+
+def test_a_folder_of_clouds_hides_no_released_model_but_a_run_does(monkeypatch, saved) -> None:
+    model = saved / "weights" / "oven.safetensors"
+    monkeypatch.setattr("scapo.released.weights", lambda: {"oven": model})
+    monkeypatch.chdir(saved)
+    (saved / "oven" / "test").mkdir(parents=True)
+    assert find("oven") == model
+    (saved / WEIGHTS).rename(saved / "oven" / WEIGHTS)
+    assert find("oven") == Path("oven")
 
 
 def test_released_weights_are_those_of_categories() -> None:
