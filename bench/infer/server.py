@@ -267,10 +267,11 @@ class Demo:
             mask=mask,
         )
         models = self._models(request.form.get("category", ""))
+        given = "category" if self.request.checkpoint is None else "run"
         try:
             with self.work:  # one at a time: a model uses all cores by itself
                 cloud = read_input(path, options)
-                result = answer(stem, cloud, models, self.request.mode, "category")
+                result = answer(stem, cloud, models, self.request.mode, given)
                 made = write_result(result, folder / "result")
         except (ValueError, OSError, ArithmeticError, RuntimeError, MemoryError) as error:
             words = one_line(error).replace(str(path), f"{stem}{suffix}")

@@ -87,6 +87,15 @@ def test_a_dropped_file_gives_its_page_and_files(demo, cloud):
     assert not list(demo.folder.rglob("input*"))  # what was dropped is not kept
 
 
+@pytest.mark.parametrize("given", ["run", "category"])
+def test_a_result_says_what_named_its_model(given, told, cloud, tmp_path):
+    request = DemoRequest(mode="fast", checkpoint=Path("oven") if given == "run" else None)
+    demo = Demo(request, [told_model(told)], tmp_path)
+    place = post(demo, cloud).headers["Location"]
+    record = json.loads(get(demo, place.replace("page.html", "joints.json")).data)
+    assert record["category"]["chosen_by"] == given
+
+
 @pytest.mark.parametrize(
     ("data", "name", "form", "code", "message"),
     [
