@@ -80,7 +80,7 @@ def _primitive(
     faces = np.asarray(surface.faces).astype(np.uint32).reshape(-1)
     material = {
         "pbrMetallicRoughness": {
-            "baseColorFactor": [float(value) for value in surface.color],
+            "baseColorFactor": [*map(_linear, surface.color[:3]), float(surface.color[3])],
             "metallicFactor": 0.0,
             "roughnessFactor": 0.8,
         }
@@ -91,6 +91,11 @@ def _primitive(
         "indices": _accessor(tree, data, faces, _INDICES),
         "material": len(tree["materials"]) - 1,
     }
+
+
+def _linear(value: float) -> float:
+    """A value of sRGB as glTF's factors have it."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
 
 
 def _accessor(tree: dict[str, Any], data: bytearray, array: np.ndarray, target: int) -> int:

@@ -41,6 +41,7 @@ class Surface:
     faces: Int[np.ndarray, "F 3"]
     """Counter-clockwise seen from outside."""
     color: RGBA = (0.7, 0.7, 0.7, 1.0)
+    """sRGB."""
     piece: bool = False
     """Of a surface that others close, or that has its reverse beside it where it is open."""
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,6 +47,13 @@ def read(path: Path) -> np.ndarray:
     return np.unique(np.round(scene.to_mesh().vertices, 5) + 0.0, axis=0)
 
 
+def described(path: Path) -> dict[str, Any]:
+    """The JSON chunk."""
+    data = path.read_bytes()
+    (size,) = struct.unpack("<I", data[12:16])
+    return json.loads(data[20 : 20 + size])
+
+
 def expected(points: np.ndarray) -> np.ndarray:
     return np.unique(np.round(points @ Y_UP.T, 5) + 0.0, axis=0)
 
@@ -76,6 +85,15 @@ def test_a_slider_is_shifted(tmp_path: Path):
     np.testing.assert_allclose(read(tmp_path / "drawer.glb"), expected(points), atol=2e-5)
 
 
+def test_colours_are_linear_as_gltf_asks(tmp_path: Path):
+    """sRGB's middle grey of 188 is half the light of white."""
+    grey = replace(cube((0, 0, 0)), color=(0.0, 188 / 255, 1.0, 0.5))
+    write_glb(tmp_path / "a.glb", [Link(name="body", surfaces=(grey,))], [])
+    (material,) = described(tmp_path / "a.glb")["materials"]
+    factor = material["pbrMetallicRoughness"]["baseColorFactor"]
+    assert factor == pytest.approx([0.0, 0.5, 1.0, 0.5], abs=0.004)
+
+
 def test_container_and_joint_data(tmp_path: Path):
     links, joints = door()
     write_glb(tmp_path / "a.glb", links, joints)
@@ -84,8 +102,7 @@ def test_container_and_joint_data(tmp_path: Path):
     assert data == (tmp_path / "b.glb").read_bytes()
     magic, version, total = struct.unpack("<III", data[:12])
     assert (magic, version, total) == (0x46546C67, 2, len(data))
-    (size,) = struct.unpack("<I", data[12:16])
-    tree = json.loads(data[20 : 20 + size])
+    tree = described(tmp_path / "a.glb")
     node = next(node for node in tree["nodes"] if node["name"] == "door")
     assert node["extras"] == {
         "joint": "hinge",
