@@ -21,7 +21,7 @@ from scapo.store import Split, open_split, write_bytes
 from scapo.store.files import Header, require_suffix
 from scapo.store.json_records import readable_json
 from scapo.store.provenance import commit, machine
-from scapo.store.samples import SampleDataset
+from scapo.store.samples import SampleDataset, observed
 from scapo.types import Observation
 
 FORMAT = "scapo-stability/1"
@@ -40,8 +40,10 @@ def measure_stability(request: StabilityRequest) -> dict[str, Any]:
     method.to(device)
     split = open_split(request.data, header["category"], request.split)
     index = evenly(split.manifest.count, request.samples)
-    batch = SampleDataset(split, ("points", "instance")).batch(index)
+    batch = SampleDataset(split, observed(split)).batch(index)
     points, instance = batch["points"].numpy(), batch["instance"].numpy()
+    if "sensor" in batch:  # clouds are turned about their cameras, which are put at the origin
+        points = points - batch["sensor"].numpy()[:, None]
     plan = Plan(
         motions=request.motions,
         resamplings=request.resamplings,

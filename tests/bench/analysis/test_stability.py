@@ -28,6 +28,7 @@ from bench.analysis.stability import (
     summary,
 )
 from bench.cli.console import quantity, stability_tables
+from bench.runs import stability as runs
 from bench.statistics import BOOTSTRAP_SEED
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from tests.helpers.splits import write_split
@@ -253,6 +254,21 @@ def test_intervals_are_those_of_one_draw_after_the_other() -> None:
     found = summary(values, instance)["median"]
     assert found["value"] == pytest.approx(np.nanmedian(values))
     np.testing.assert_allclose([found["low"], found["high"]], [low, high], atol=1e-12)
+
+
+def test_clouds_in_another_frame_are_asked_about_from_their_cameras(tmp_path, monkeypatch) -> None:
+    sensor = np.array([[0.3, -0.2, 0.5]] * 6, np.float32)
+    change = {"points": clouds(6, 96) + sensor[:, None], "part": np.zeros((6, 96), np.uint8)}
+    write_split(tmp_path / "data" / "laptop" / "test", split="test", counts=(6,), points=96,
+                change=change | {"sensor": sensor})  # fmt: skip
+    header = checkpoint_header("scapo", TINY, "laptop", {"seed": 3, "steps": 0})
+    write_checkpoint(tmp_path / "run" / WEIGHTS, tiny(), header)
+    asked, measure = [], runs.measure
+    monkeypatch.setattr(runs, "measure", lambda *x: asked.append(x[1]) or measure(*x))
+    program.main(["stability", str(tmp_path / "run"), "--data", str(tmp_path / "data"), "--out",
+                  str(tmp_path / "out.json"), "--mode", "fast", "--samples", "6",
+                  "--resamplings", "0", "--motions", "1"])  # fmt: skip
+    np.testing.assert_allclose(asked[0], clouds(6, 96), atol=1e-6)
 
 
 def test_the_command_writes_a_report_and_a_table(tmp_path, capsys) -> None:
