@@ -3,7 +3,8 @@
 
 For each run and inference mode: predictions on the training split (some, for the frames) and on
 the split to be scored, scores, the oracle ladder, pictures; for each run its stability. What is
-there and newer than its run stays, so a study that was interrupted goes on.
+there and was asked for in the same way, of the same run and data, stays (`asked/` says how), so a
+study that was interrupted goes on and a page never tells of another question.
 """
 
 from __future__ import annotations
@@ -29,11 +30,16 @@ from bench.requests import (
 )
 from bench.runs.predict import Watch, predict
 from bench.runs.stability import measure_stability
-from scapo.store import StoreError
+from scapo.released import find as find_checkpoint
+from scapo.store import StoreError, open_split, sha256_file, write_bytes
 from scapo.store.checkpoint import weights_file
+from scapo.store.files import read_header
+from scapo.store.json_records import readable_json
 
 LONGEST_NAME = 150
 """Characters of a run's name in names of files, which may have 255 bytes."""
+ASKED = "asked"
+"""Folder that says of each file what was asked for when it was made."""
 
 
 def study(request: StudyRequest, say: Callable[[str], None], watch: Watch = iter) -> Path:
@@ -98,7 +104,7 @@ class _Study:
         scored = out / "predictions" / f"{name}-{split}.safetensors"
         trained = out / "predictions" / f"{name}-train.safetensors"
         self._predict(run, scored, mode, None)
-        if calibrated:
+        if calibrated and trained != scored:
             self._predict(run, trained, mode, self.request.calibration)
         inputs = (scored, trained) if calibrated else (scored,)
         frames = trained if calibrated else None
@@ -115,6 +121,7 @@ class _Study:
             predictions=scored, data=data, out=scores, split=split, calibration=frames,
         )))  # fmt: skip
         self._made(ladder / "ladder.md", inputs, lambda: explain(asked(ladder)))
+        inputs = (weights_of(run), *inputs)
         self._made(pictures / "ranking.png", inputs, lambda: list(draw_pictures(drawn)))
         return Entry(name=name, mode=mode, scores=scores, ladder=ladder / "ladder.md",
                      pictures=pictures)  # fmt: skip
@@ -124,22 +131,47 @@ class _Study:
         asked = self.request
         out = asked.out / "stability" / f"{name}.json"
         request = StabilityRequest(
-            checkpoint=weights_file(run), data=asked.data, out=out, split=asked.split,
+            checkpoint=weights_of(run), data=asked.data, out=out, split=asked.split,
             mode=asked.mode, samples=asked.samples, device=asked.device,
         )  # fmt: skip
-        self._made(out, (request.checkpoint,), lambda: measure_stability(request))
+        self._said_by_run(request, lambda: measure_stability(request), samples=asked.samples)
 
     def _predict(self, run: Path, out: Path, mode: Mode, limit: int | None) -> None:
         asked = self.request
         request = PredictRequest(
-            checkpoint=weights_file(run), data=asked.data, out=out, mode=mode, limit=limit,
+            checkpoint=weights_of(run), data=asked.data, out=out, mode=mode, limit=limit,
             split=asked.split if limit is None else "train", device=asked.device,
         )  # fmt: skip
-        self._made(out, (request.checkpoint,), lambda: predict(request, self.watch))
+        self._said_by_run(request, lambda: predict(request, self.watch), limit=limit)
 
-    def _made(self, out: Path, inputs: tuple[Path, ...], make: Callable[[], object]) -> None:
-        """Make a file unless it is newer than all its inputs."""
-        if out.is_file() and all(out.stat().st_mtime >= path.stat().st_mtime for path in inputs):
+    def _said_by_run(
+        self, request: PredictRequest | StabilityRequest, make: Callable[[], object], **more: object
+    ) -> None:
+        """Make what a run says of a split."""
+        category = read_header(request.checkpoint)["category"]
+        split = open_split(request.data, category, request.split).manifest
+        about = {"data": split.digest, "split": split.split, "mode": request.mode, **more}
+        self._made(request.out, (request.checkpoint,), make, **about)
+
+    def _made(
+        self,
+        out: Path,
+        inputs: tuple[Path, ...],
+        make: Callable[[], object],
+        **about: object,
+    ) -> None:
+        """Make a file unless it is there, of the same inputs and asked for in the same way."""
+        asked = {**about, "inputs": [sha256_file(path) for path in inputs]}
+        words, folder = readable_json(asked).encode(), self.request.out
+        record = folder / ASKED / f"{out.relative_to(folder)}.json"
+        if out.is_file() and record.is_file() and record.read_bytes() == words:
             return
         self.say(f"study: {out}")
+        record.unlink(missing_ok=True)  # else it would speak of what an interrupt leaves half made
         make()
+        write_bytes(record, words)
+
+
+def weights_of(run: Path) -> Path:
+    """The checkpoint of a run folder or released model."""
+    return weights_file(find_checkpoint(run))

@@ -4,13 +4,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench import __main__ as program
 from bench.analysis.study_page import PAGE
+from bench.requests import Request, StudyRequest
+from bench.runs import study
 from bench.runs.predict import joined
+from scapo.store import write_bytes
 from scapo.store.checkpoint import WEIGHTS, checkpoint_header, write_checkpoint
 from scapo.store.files import read
 from tests.helpers import made
@@ -57,6 +62,44 @@ def test_a_study_is_made_once_and_told_on_one_page(tmp_path, capsys) -> None:
     assert printed.count("study: ") == 1
     assert "seed2-fast.csv.gz" in printed
     assert (out / PAGE).read_text() == page
+
+
+def test_another_question_is_answered_anew(tmp_path, monkeypatch) -> None:
+    for name, count in (("data", 4), ("more", 5)):
+        made.make_data(tmp_path / name, "laptop", count=count, train=6, points=96)
+    run, out = write_run(tmp_path / "run", 1), tmp_path / "study"
+
+    def make(request: Request) -> None:
+        limit = getattr(request, "limit", "")
+        write_bytes(request.out, f"{request.data} {request.split} {limit}".encode())
+
+    for name in ("predict", "evaluate_beside", "measure_stability"):
+        monkeypatch.setattr(study, name, lambda request, *_: make(request))
+    for name, file in (("explain", "ladder.md"), ("draw_pictures", "ranking.png")):
+        below = lambda request, file=file: make(replace(request, out=request.out / file)) or ()  # noqa: E731
+        monkeypatch.setattr(study, name, below)
+    monkeypatch.setattr(study, "write_page", lambda out, *_: out)
+
+    def asked(data: str = "data", split: str = "test", **other: int) -> list[str]:
+        said: list[str] = []
+        request = StudyRequest(
+            runs=(Path(run),), data=tmp_path / data, out=out, split=split, mode="fast", **other
+        )
+        study.study(request, said.append)
+        scores = (out / "scores" / "laptop-scapo-cpu-seed1-fast.csv.gz").read_text()
+        assert scores.startswith(f"{tmp_path / data} {split}")
+        return [Path(line).name for line in said]
+
+    name = "laptop-scapo-cpu-seed1"
+    shown = [f"{name}-fast.csv.gz", "ladder.md", "ranking.png"]
+    frames, scored = f"{name}-fast-train.safetensors", f"{name}-fast-test.safetensors"
+    assert asked() == [scored, frames, *shown, f"{name}.json"]
+    assert asked() == []
+    assert asked(samples=5) == [f"{name}.json"]
+    assert asked(samples=5, calibration=3) == [frames, *shown]
+    assert asked(samples=5, split="train") == [frames, *shown, f"{name}.json"]
+    assert asked(samples=5) == [frames, *shown, f"{name}.json"]
+    assert asked("more", samples=5) == [scored, *shown, f"{name}.json"]
 
 
 def test_runs_of_one_name_are_refused(tmp_path, capsys) -> None:
