@@ -110,6 +110,7 @@ def execute(
     Yields:
         The name of each chain that ended, and how its steps did.
     """
+    out, data = out.absolute(), data.absolute()  # a worker of a cluster has another working folder
     jobs = [
         Job(chain=chain, out=out, data=data, config=plan.configs[chain.label], code=plan.code,
             commit=plan.commit, processes=max(1, int(machines.gpus)))

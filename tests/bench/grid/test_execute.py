@@ -14,6 +14,8 @@ import pytest
 
 from bench.grid import command
 from bench.grid.execute import Estimate, Machines, execute
+from bench.grid.plan import chosen
+from scapo.parallel.pool import Pool
 from tests.helpers.grids import CALLS, calls, make_splits, plan_of, run
 
 
@@ -152,8 +154,6 @@ def test_on_ray_the_outcomes_are_the_same(folder: Path, monkeypatch):
 
     def opened(engine, workers, *, gpus):
         asked.append((engine, workers, gpus))
-        from scapo.parallel.pool import Pool
-
         return Pool(0)
 
     monkeypatch.setattr("bench.grid.execute.open_pool", opened)
@@ -162,3 +162,21 @@ def test_on_ray_the_outcomes_are_the_same(folder: Path, monkeypatch):
     done = dict(execute(plan, plan.chains, folder / "out", folder / "data", machines))
     assert asked == [("ray", None, 0.5)]
     assert {one.state for ended in done.values() for one in ended} == {"made"}
+
+
+def test_workers_of_a_cluster_find_folders_that_were_named_from_here(
+    folder: Path, repository: Path, monkeypatch
+):
+    class Elsewhere(Pool):
+        def run(self, *asked, **named):
+            monkeypatch.chdir(folder / "data")
+            return super().run(*asked, **named)
+
+    monkeypatch.setattr("bench.grid.execute.open_pool", lambda *_, **__: Elsewhere(0))
+    monkeypatch.setenv("PYTHONPATH", str(repository))
+    plan = plan_of(folder)
+    monkeypatch.chdir(folder)
+    chains = chosen(plan.chains, ["icp"])
+    done = dict(execute(plan, chains, Path("out"), Path("data"), Machines(engine="ray")))
+    assert {one.state for ended in done.values() for one in ended} == {"made"}
+    assert all((folder / "out" / step.output).is_file() for step in chains[0].steps)
