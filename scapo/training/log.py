@@ -86,8 +86,9 @@ class Log:
         self.sums, self.count = {}, 0
 
     def validation(self, step: int, stage: str, loss: float) -> None:
-        """A line of a validation pass."""
-        self._append({"step": step, "stage": stage, "validation": loss})
+        """A line of a validation pass; null where the loss is no number that JSON has."""
+        said = loss if math.isfinite(loss) else None
+        self._append({"step": step, "stage": stage, "validation": said})
         self.scalar(f"{stage}/validation", loss, step)
 
     def _append(self, record: dict[str, Any]) -> None:

@@ -88,6 +88,14 @@ def test_the_best_state_is_kept_and_the_clouds_are_others(tmp_path: Path) -> Non
     assert (starts[0] - method.weights[3]).abs().max() > lr + 1e-3
 
 
+def test_a_pass_that_is_not_finite_is_no_best_and_no_end(tmp_path: Path) -> None:
+    method = Judged()
+    method.judged = (torch.nan, 3.0, torch.inf, 4.0)
+    fit.fit(method, tiny_data(), tmp_path, CONFIG)
+    rows = [row for row in metrics(tmp_path) if "validation" in row]
+    assert [row["validation"] for row in rows] == [None, 3.0, None, 4.0]
+
+
 @pytest.mark.parametrize("stop", [5, 9, 10, 20, 25])
 def test_a_run_with_validation_continues_bit_for_bit(tmp_path: Path, stop: int) -> None:
     fit.fit(Judged(), tiny_data(), tmp_path / "whole", CONFIG)
