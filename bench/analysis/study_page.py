@@ -41,6 +41,8 @@ class Entry:
     scores: Path
     ladder: Path
     pictures: Path
+    stability: Path | None = None
+    """Report of the run, in all modes; None: not asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +85,7 @@ def write_page(out: Path, entries: Iterable[Entry], command: str) -> Path:
              _row(["run", "mode", *headings, "clouds/s"]),
              _row(["---", "---", *("---:" for _ in headings), "---:"])]  # fmt: skip
     lines += [_row(_scores_row(entry)) for entry in entries]
-    lines += ["", *_stability(out), "", "## Where the numbers come from", "",
+    lines += ["", *_stability(entries), "", "## Where the numbers come from", "",
               _row(["run", "mode", "seed", "training", "data", "code of the run", "machine"]),
               _row(["---"] * 7)]  # fmt: skip
     lines += [_row(_origin(entry)) for entry in entries]
@@ -128,9 +130,9 @@ def _origin(entry: Entry) -> list[str]:
     ]  # fmt: skip
 
 
-def _stability(out: Path) -> list[str]:
+def _stability(entries: Iterable[Entry]) -> list[str]:
     rows = []
-    for path in sorted((out / "stability").glob("*.json")):
+    for path in dict.fromkeys(one.stability for one in entries if one.stability is not None):
         for mode, found in from_json(Stability, read_json(path), str(path)).modes.items():
             moved, drawn = found.equivariance.get("both", {}), found.resampling
             cells = [_pair(moved.get(name)) for name in MOVED.values()]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from bench.analysis.beside import evaluate_beside
@@ -65,9 +66,9 @@ def study(request: StudyRequest, say: Callable[[str], None], watch: Watch = iter
         name, calibrated = _name(run)
         if any(entry.name.rpartition("-")[0] == name for entry in entries):
             raise StoreError(f"{run}: expected runs of different names, found {name!r} twice")
-        entries += [work.mode(run, f"{name}-{mode}", mode, calibrated) for mode in modes]
-        if request.samples:
-            work.stability(run, name)
+        of_run = [work.mode(run, f"{name}-{mode}", mode, calibrated) for mode in modes]
+        report = work.stability(run, name)
+        entries += [replace(entry, stability=report) for entry in of_run]
     return write_page(request.out, entries, command(request))
 
 
@@ -126,15 +127,18 @@ class _Study:
         return Entry(name=name, mode=mode, scores=scores, ladder=ladder / "ladder.md",
                      pictures=pictures)  # fmt: skip
 
-    def stability(self, run: Path, name: str) -> None:
-        """The stability report of a run."""
+    def stability(self, run: Path, name: str) -> Path | None:
+        """The stability report of a run, if it is asked for."""
         asked = self.request
+        if not asked.samples:
+            return None
         out = asked.out / "stability" / f"{name}.json"
         request = StabilityRequest(
             checkpoint=weights_of(run), data=asked.data, out=out, split=asked.split,
             mode=asked.mode, samples=asked.samples, device=asked.device,
         )  # fmt: skip
         self._said_by_run(request, lambda: measure_stability(request), samples=asked.samples)
+        return out
 
     def _predict(self, run: Path, out: Path, mode: Mode, limit: int | None) -> None:
         asked = self.request

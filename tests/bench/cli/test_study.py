@@ -78,13 +78,18 @@ def test_another_question_is_answered_anew(tmp_path, monkeypatch) -> None:
     for name, file in (("explain", "ladder.md"), ("draw_pictures", "ranking.png")):
         below = lambda request, file=file: make(replace(request, out=request.out / file)) or ()  # noqa: E731
         monkeypatch.setattr(study, name, below)
-    monkeypatch.setattr(study, "write_page", lambda out, *_: out)
+    told: list[Path | None] = []
+    page = lambda out, entries, *_: told.extend(one.stability for one in entries) or out  # noqa: E731
+    monkeypatch.setattr(study, "write_page", page)
 
-    def asked(data: str = "data", split: str = "test", **other: int) -> list[str]:
+    def asked(
+        data: str = "data", split: str = "test", samples: int = 20, calibration: int = 500
+    ) -> list[str]:
         said: list[str] = []
         request = StudyRequest(
-            runs=(Path(run),), data=tmp_path / data, out=out, split=split, mode="fast", **other
-        )
+            runs=(Path(run),), data=tmp_path / data, out=out, split=split, mode="fast",
+            samples=samples, calibration=calibration,
+        )  # fmt: skip
         study.study(request, said.append)
         scores = (out / "scores" / "laptop-scapo-cpu-seed1-fast.csv.gz").read_text()
         assert scores.startswith(f"{tmp_path / data} {split}")
@@ -100,6 +105,8 @@ def test_another_question_is_answered_anew(tmp_path, monkeypatch) -> None:
     assert asked(samples=5, split="train") == [frames, *shown, f"{name}.json"]
     assert asked(samples=5) == [frames, *shown, f"{name}.json"]
     assert asked("more", samples=5) == [scored, *shown, f"{name}.json"]
+    assert asked("more", samples=0) == []
+    assert told[-2:] == [out / "stability" / f"{name}.json", None]
 
 
 def test_runs_of_one_name_are_refused(tmp_path, capsys) -> None:
