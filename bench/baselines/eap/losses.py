@@ -47,11 +47,16 @@ def slot_distances(
 def whole(
     posed: Float[Tensor, "B S M 3"], points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B S"]
 ) -> Scalar:
-    """Two-way Chamfer distance of all shapes of slots with points from the cloud."""
-    first = present.long().argmax(1)
-    kept = posed[torch.arange(len(posed), device=posed.device), first][:, None, :1]
-    shape = torch.where(present[..., None, None], posed, kept).flatten(1, 2)
-    return chamfer(points, shape).mean()
+    """Two-way Chamfer distance of all shapes of slots with points from the cloud.
+
+    Shapes of other slots are left out both ways: no point is near to them, and they count nowhere.
+    """
+    rows = torch.arange(len(posed), device=posed.device)
+    stand_in = posed[rows, present.long().argmax(1)][:, None]  # of a slot that is there anyway
+    shape = torch.where(present[..., None, None], posed, stand_in).flatten(1, 2)
+    share = present.to(posed.dtype).repeat_interleave(posed.shape[2], 1)  # (B, S M)
+    back = (squared_distances(shape, points) * share).sum(1) / share.sum(1)
+    return (squared_distances(points, shape).mean(1) + back).mean()
 
 
 def pivots_near_parts(

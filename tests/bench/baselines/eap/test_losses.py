@@ -64,17 +64,19 @@ def test_weights_are_drawn_to_the_slot_that_fits_better() -> None:
 
 
 def test_whole_leaves_out_slots_without_points() -> None:
-    posed, points = cloud(0, 1, 3, 6), cloud(1, 1, 12)
-    present = torch.tensor([[False, True, True]])
+    posed, points = cloud(0, 2, 3, 6), cloud(1, 2, 12)
+    present = torch.tensor([[False, True, True], [True, False, False]])
+    posed.requires_grad_()
     found = losses.whole(posed, points, present)
-    shape = posed[0, 1:].flatten(0, 1)
-    there = nearest_squares(points[0].numpy(), shape.numpy()).mean()
-    # The shape's side is a mean over all slots' points; an absent one's are the first of the rest.
-    back = nearest_squares(shape.numpy(), points[0].numpy())
-    expected = there + (back.sum() + 6 * back[0]) / 18
-    assert float(found) == pytest.approx(expected, rel=1e-6)
-    everything = losses.whole(posed, points, torch.ones(1, 3, dtype=torch.bool))
-    assert float(everything) == pytest.approx(two_way(points[0], posed[0].flatten(0, 1)), rel=1e-6)
+    expected = [two_way(points[b], posed.detach()[b, present[b]].flatten(0, 1)) for b in range(2)]
+    assert float(found.detach()) == pytest.approx(np.mean(expected), rel=1e-6)
+    found.backward()
+    gradient = posed.grad
+    assert gradient is not None
+    assert (gradient[~present] == 0).all()
+    everything = losses.whole(posed.detach(), points, torch.ones(2, 3, dtype=torch.bool))
+    expected = [two_way(points[b], posed.detach()[b].flatten(0, 1)) for b in range(2)]
+    assert float(everything) == pytest.approx(np.mean(expected), rel=1e-6)
 
 
 def test_pivots_and_their_shifts_are_near_both_parts() -> None:
