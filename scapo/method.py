@@ -228,6 +228,8 @@ class AbstractMethod(nn.Module, ABC):
     """The mode in which users are answered who ask for none."""
     least_points: int = 1
     """Points that a cloud needs to be predicted at all."""
+    least_batch: ClassVar[int] = 1
+    """Clouds that a step of training needs: a norm over clouds alone has nothing to say of one."""
     takes_up: ClassVar[bool] = False
     """Whether it uses `Observation.up`."""
     up: tuple[float, ...] | None = None

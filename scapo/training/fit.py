@@ -113,7 +113,8 @@ def fit(
         TrainingError: The loss or its gradient is not finite.
         StoreError: `resume` with another configuration or other data, or a run is there without
             `resume`; or the folder cannot be written, what was saved before is whole.
-        ValueError: Fewer samples in a batch than ranks, or a precision that the method lacks.
+        ValueError: Fewer samples in a batch than ranks or method need, or a precision that the
+            method lacks.
     """
     Trainer(method, data, folder, config, listener).run(resume=resume)
 
@@ -260,10 +261,11 @@ class Trainer:
         position = self.state.position
         total = self.data.observation.points.shape[0]
         used, samples = self.method.rows(stage, total), min(total, stage.clouds or total)
-        size = min(stage.batch, samples)
-        if size < self.ranks.count:
+        size, least = min(stage.batch, samples), self.method.least_batch * self.ranks.count
+        if size < least:
             raise ValueError(
-                f"batch: expected a sample for each of {self.ranks.count} ranks, found {size}"
+                f"batch: expected at least {least} clouds in a step of {self.method.name} on "
+                f"{self.ranks.count} ranks, found {size}"
             )
         steps = samples // size
         for epoch in range(position.epoch, stage.epochs):

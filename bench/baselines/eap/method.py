@@ -124,6 +124,7 @@ class Eap(AbstractMethod):
 
     name: ClassVar[str] = "eap"
     networks = ("whole_stage.encoder", "part_stage.encoder", "part_stage.grouping")
+    least_batch = 2  # norms of the layers on codes, one a cloud
     usual_base: Tensor
     usual_anchor: Tensor
 

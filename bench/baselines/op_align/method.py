@@ -186,6 +186,7 @@ class OpAlign(AbstractMethod):
 
     name: ClassVar[str] = "op-align"
     networks = ("backbone", "head", "decoder", "point_network")
+    least_batch = 2  # norms of the layers on codes, one a cloud
 
     def __init__(
         self, config: OpAlignConfig, category: Category, generator: torch.Generator

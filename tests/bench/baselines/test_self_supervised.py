@@ -52,6 +52,19 @@ def test_labels_change_neither_training_nor_prediction(name: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize(("batch", "clouds"), [(1, 4), (8, 1)])
+def test_steps_of_one_cloud_are_refused_in_words(
+    name: str, batch: int, clouds: int, tmp_path: Path
+) -> None:
+    config = replace(CONFIGS[name], batch=batch)
+    method = METHODS[name].build(config, CATEGORIES["laptop"], generator(0))
+    observation, labels = plates(clouds, 48)
+    data = TrainingData(observation=observation, labels=labels, digest="plates")
+    with pytest.raises(ValueError, match=f"at least 2 clouds in a step of {name} .* found 1"):
+        fit(method, data, tmp_path, FitConfig(pictures_every=None))
+
+
+@pytest.mark.parametrize("name", CONFIGS)
 def test_networks_in_half_precision_leave_poses_whole(name: str) -> None:
     method = settle(METHODS[name].build(CONFIGS[name], CATEGORIES["laptop"], generator(0)))
     observation, _ = plates(6, 48)
