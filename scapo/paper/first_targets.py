@@ -81,7 +81,7 @@ def first_targets(
     axis_x = axis_y @ turn.mT
     twist = turn.mT[:, None] @ rotation_between(axis_x, axis_y).mT  # about axis_y (B, J, 3, 3)
     angle = (rotmat_to_rotvec(twist) * axis_y).sum(-1)
-    hinge = torch.tensor([kind == "revolute" for kind in kinds])
+    hinge = torch.tensor([kind == "revolute" for kind in kinds], device=angle.device)
     angle = torch.where(hinge, angle, 0.0)
     keypoints = [own.keypoints[:, :1]]
     for j, kind in enumerate(kinds):

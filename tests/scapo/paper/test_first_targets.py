@@ -15,6 +15,7 @@ from scapo.paper.first_targets import Inputs, first_targets, fit_networks, lying
 from scapo.paper.heads import JointNetwork, KeypointNetwork, ResidualNetwork
 from scapo.paper.part_search import Placements, Skeleton, T, having, posed, values
 from scapo.paper.skinning import Bones, cross_maps, deform, part_maps
+from scapo.records import map_tensors
 from tests.helpers.strategies import generator, normal
 from tests.helpers.tiny import TINY
 
@@ -58,6 +59,13 @@ def test_the_cross_maps_of_the_targets_are_the_placements(joints: int) -> None:
     assert_close(deform(maps, template, weights), posed(s, at, kinds), atol=1e-6, rtol=0)
     parts = posed(s, at, kinds).unflatten(1, (joints + 1, 20)).mean(2)
     assert_close(wanted.keypoints, parts, atol=1e-6, rtol=0)
+
+
+def test_targets_are_made_on_the_device_of_the_clouds() -> None:
+    s, at = skeleton(2), placements(2)
+    own = map_tensors(lying(s, at), lambda x: x.to("meta"))
+    wanted = first_targets(s.points.to("meta"), own, ("revolute", "prismatic"))
+    assert wanted.joints.state.device.type == wanted.keypoints.device.type == "meta"
 
 
 def test_a_slide_keeps_its_way_and_the_axis_turns_along() -> None:
