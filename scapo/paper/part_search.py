@@ -56,7 +56,7 @@ class SearchConfig:
     steps: tuple[int, ...] = (40, 60, 150)
     """Steps of Adam in each round."""
     points: int = 512
-    """Points of the template."""
+    """Points of the template, or all of a shape that has more."""
     asked: int = 256
     """Points of each cloud, and of the template, whose nearest is looked for in a step."""
     rate: float = 0.02
@@ -314,7 +314,8 @@ class PartSearch:
             It, and of each round the misfit of every start, rising.
         """
         c = self.config
-        number = torch.arange(c.points, device=template.device) * len(template) // c.points
+        count = max(c.points, len(template))  # of these every point of a shape is given one
+        number = torch.arange(count, device=template.device) * len(template) // count
         whole = self.in_one_piece(template[number])
         sides, at = zip(*(self.most_alike(half, whole) for half in clouds.chunk(2)), strict=True)
         starts = self.starts(whole.points, sides[0], at[0])

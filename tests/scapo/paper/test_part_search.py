@@ -142,3 +142,12 @@ def test_every_round_says_what_its_starts_left() -> None:
     _, said = PartSearch(("revolute",), brief).search(clouds[0], clouds)
     assert [len(row) for row in said] == [13, 2]
     assert all(row == sorted(row) for row in said)
+
+
+def test_a_shape_of_more_points_than_asked_for_is_covered() -> None:
+    clouds, _ = hinged(torch.linspace(0.4, 2.0, 4))
+    few = SearchConfig(
+        seeds=1, clouds=(1,), alike=1, kept=(), steps=(1,), points=20, asked=20, placing=1
+    )
+    found, _ = PartSearch(("revolute",), few).search(clouds[0], clouds)
+    assert found.laid_over(clouds[0]).points.shape == clouds[0].shape
