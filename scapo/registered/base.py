@@ -33,6 +33,7 @@ from scapo.registered.discovery import Discovery
 from scapo.registered.figures import template_pictures
 from scapo.registered.joint_limits import JointLimits, limits_of
 from scapo.registered.learning import (
+    FIRST,
     Said,
     SeenClouds,
     candidates,
@@ -41,6 +42,7 @@ from scapo.registered.learning import (
     learned_row,
     taught,
     taught_in_principal_frames,
+    taught_rows,
     undeviated,
     voted,
 )
@@ -72,7 +74,6 @@ from scapo.registered.views import NEIGHBOURS, PartialViews, observe, surface_no
 from scapo.types import Labels, Observation, Prediction
 
 LEAST_CLOUDS = 8  # Views that a template can be found in at all, two of which judge
-FIRST = "votes"  # Stage of the network's first round
 LAST_RATE = 0.01  # Share of the learning rate at the end
 PLACED, KEPT = 50, 250  # Clouds that are placed at a time, and after which what was found is kept
 PLACING, LATE = 0.08, 0.8
@@ -141,7 +142,7 @@ class AbstractRegistered(AbstractMethod):
     ) -> None:
         """Find the template, and its placement in the clouds that the network will learn."""
         if stage != FIRST:
-            self._place(observation.points, labels, generator)
+            self._place(observation.points, labels, generator, stage)
             return
         if len(observation.points) < LEAST_CLOUDS:
             raise ValueError(
@@ -162,32 +163,30 @@ class AbstractRegistered(AbstractMethod):
         self.pseudo.belonging = inlier
         self._learn_orientation(views, made, seed)
         self.to(device)
-        self._place(observation.points, labels, generator, LATE)
+        self._place(observation.points, labels, generator, stage)
 
     def _place(
         self,
         cloud: Float[Tensor, "B N 3"],
         labels: Labels,
         generator: torch.Generator,
-        begun: float = 0.0,
+        stage: str,
     ) -> None:
-        """Find on the host what the network learns, as `quick` would: a few candidates of each.
-
-        `begun` is the share of the start that is over before.
-        """
+        """Find on the host what the network learns, as `quick` would: a few candidates of each."""
         if not isinstance(self.network, ViewNetwork):
             return
         device = self.template.points.device
         self.cpu()
         self.eval()  # it is asked, and learns nothing yet
         self.targets.clear()
-        index = evenly(len(cloud), self._taught()).to(cloud.device)
+        index = taught_rows(len(cloud), self._taught(), stage).to(cloud.device)
         cloud, labels = cloud[index].cpu(), map_tensors(take(labels, index), Tensor.cpu)
         host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
         makers = {kind.__name__: kind for kind in (Candidates, Placement)}
         parts, total = list[Candidates](), len(index)
         jobs = [partial(self._candidates_of_all, some) for some in cloud.split(KEPT)]
         for done, make in zip(range(0, total, KEPT), self.journal.ahead(jobs), strict=True):
+            begun = LATE if stage == FIRST else 0.0
             share = begun + (1 - begun) * done / total
             self.journal.tell(f"placing clouds, {done} of {total}", share, PLACING * (total - done))
             parts.append(self.journal.once(f"placed clouds from {done} on", make, host, makers))
@@ -288,7 +287,7 @@ class AbstractRegistered(AbstractMethod):
     def rows(self, stage: Stage, total: int) -> Int[Tensor, " K"]:
         """Those whose placements are trusted."""
         trust = self.targets.trust if isinstance(self.network, ViewNetwork) else self.pseudo.trust
-        return super().rows(stage, total)[(trust > 0).cpu()]
+        return taught_rows(total, self._taught(), stage.name)[(trust > 0).cpu()]
 
     def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
         """The network's votes against the placements that were found (`learning`)."""

@@ -46,6 +46,7 @@ from scapo.registered.view_network import (
 )
 from scapo.registered.views import PartialViews
 
+FIRST = "votes"  # Stage of the network's first round; those after it are `round-2` and so on
 NOISE = 0.003  # Normalised length: standard deviation of the points' noise while a network learns
 SAMPLED = 2  # Times `count` points that are drawn from a cloud, of which the farthest are learned
 THINNED = 0.2  # Share of a cloud's points that the network may not be shown in a step
@@ -99,13 +100,27 @@ class SeenClouds:
         return ((weight + LEAST).log() + WORD * word).softmax(-1)
 
 
+def taught_rows(total: int, count: int, stage: str) -> Int[Tensor, " K"]:
+    """Training clouds that a round of the network learns from: so many, evenly spread, in order.
+
+    Others than those of the round before, where there are enough: what a network says of clouds
+    that it was taught is what it was taught, right or wrong.
+
+    >>> taught_rows(10, 4, "votes"), taught_rows(10, 4, "round-2"), taught_rows(10, 4, "round-3")
+    (tensor([0, 3, 6, 9]), tensor([0, 1, 4, 7]), tensor([0, 3, 6, 9]))
+    """
+    number = 0 if stage == FIRST else int(stage.rpartition("-")[2]) - 1
+    apart = number % max(1, total // count)
+    return ((evenly(total, count) + apart) % total).sort().values
+
+
 def learned_row(step: Step, count: int) -> Int[Tensor, " B"]:
-    """Which of so many learned clouds, evenly spread over the training, a batch holds.
+    """Which of the clouds that its round learns from, so many, a batch holds.
 
     Raises:
         ValueError: A cloud whose placement was not searched for.
     """
-    learned = evenly(step.total, count).to(step.index.device)
+    learned = taught_rows(step.total, count, step.stage).to(step.index.device)
     row = torch.searchsorted(learned, step.index).clamp(max=len(learned) - 1)
     if bool((learned[row] != step.index).any()):
         raise ValueError("expected clouds whose placements were found, found others")

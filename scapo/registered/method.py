@@ -36,14 +36,14 @@ from scapo.geometry.points import normalise
 from scapo.method import ParameterGroup, Stage, Step, changes, evenly
 from scapo.records import cat, take
 from scapo.registered.axis_deviation import square_axes, with_axis_deviation
-from scapo.registered.base import FIRST, LATE, PLACED, PLACING, AbstractRegistered
+from scapo.registered.base import PLACED, PLACING, AbstractRegistered
 from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
 from scapo.registered.course import DEVIATION, JUDGES, VIEW, Course, are_alike, plan_of
 from scapo.registered.discovery import Discovery, discover
 from scapo.registered.gauge import settle_hinges
 from scapo.registered.halves import cut_by_mirror
-from scapo.registered.learning import candidates
+from scapo.registered.learning import FIRST, candidates
 from scapo.registered.objects import LEAST_OBJECTS, grouped, rows_by_object
 from scapo.registered.outliers import replaced
 from scapo.registered.pose_search import (
@@ -135,11 +135,9 @@ class TemplateRegistration(AbstractRegistered):
             )
         if sizes[0] == sizes[1]:
             self.network.load_state_dict(known.network.state_dict())
-        self._place(observation.points, labels, generator, LATE)
+        self._place(observation.points, labels, generator, stage)
 
-    def _place(
-        self, cloud: Tensor, labels: Labels, generator: torch.Generator, begun: float = 0.0
-    ) -> None:
+    def _place(self, cloud: Tensor, labels: Labels, generator: torch.Generator, stage: str) -> None:
         """As `AbstractRegistered`, by a template whose hinges deviate if clouds now say so."""
         asked = self.config.discovery.leans and self.config.teach == "all"
         alike = are_alike(self.template.kinds) and "revolute" in self.template.kinds
@@ -151,7 +149,7 @@ class TemplateRegistration(AbstractRegistered):
             host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
             self._ask_deviation(cloud.cpu(), host)
             self.to(device)
-        super()._place(cloud, labels, generator, begun)
+        super()._place(cloud, labels, generator, stage)
 
     def _ask_deviation(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
         """Whether two alike hinges deviate, asked again of clouds that the network helps to place.

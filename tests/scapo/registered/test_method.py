@@ -20,7 +20,7 @@ from scapo.registered.base import AbstractRegistered
 from scapo.registered.bundle_adjustment import Candidate
 from scapo.registered.config import DiscoveryConfig, RegisteredConfig, cpu_config, quick_config
 from scapo.registered.decode import nearest_weights
-from scapo.registered.learning import Said, SeenClouds, learned_row
+from scapo.registered.learning import Said, SeenClouds, learned_row, taught_rows
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.pose_search import Effort, Hypotheses
 from scapo.registered.pseudo_labels import Candidates
@@ -293,13 +293,34 @@ def test_of_many_clouds_only_the_learned_ones_have_placements():
         few.losses(batch, Labels(), at(0.0, row - 1, generator(0)))
 
 
+def test_each_round_learns_from_other_clouds_than_the_one_before_and_from_those_it_placed() -> None:
+    """A network's word on clouds that it was taught is what it was taught."""
+    first, second, third = (taught_rows(5000, 2000, x) for x in ("votes", "round-2", "round-3"))
+    assert len(set(first.tolist()) & set(second.tolist())) <= 1
+    assert torch.equal(first, third)
+    assert bool((second.diff() > 0).all())
+    assert torch.equal(taught_rows(900, 2000, "round-2"), torch.arange(900))  # there are no others
+    method, observation = trained(0)
+    few = TemplateRegistration(replace(method.config, placed=5), method.category, generator(0))
+    few.load_state_dict(method.state_dict())
+    few._place(observation.points, Labels(), generator(0), "round-2")
+    again = few.stages()[1]
+    row = few.rows(again, 12)
+    assert set(row.tolist()) <= set(taught_rows(12, 5, "round-2").tolist())
+    step = Step(stage=again.name, progress=0.0, generator=generator(0), index=row, total=12)
+    assert set(learned_row(step, 5).tolist()) == set(
+        (few.targets.trust > 0).nonzero()[:, 0].tolist()
+    )
+
+
 def variant(config: RegisteredConfig) -> str:
     return TemplateRegistration(config, CATEGORIES["oven"], generator(0)).variant
 
 
 def test_the_network_learns_from_placements_that_are_trusted() -> None:
     method, _ = trained(0)
-    stage = replace(method.stages()[0], clouds=12)
+    method.config = replace(method.config, placed=12, learned=12)
+    stage = method.stages()[0]
     trusted = torch.ones(12).index_fill(0, torch.tensor([0, 7]), 0.0)
     method.targets.trust = trusted
     assert method.rows(stage, 30).tolist() == evenly(30, 12)[trusted > 0].tolist()
@@ -421,7 +442,7 @@ def test_once_the_network_helps_to_place_clouds_two_hinges_are_asked_again_wheth
     monkeypatch.setattr(registered, "with_axis_deviation", leaning)
     monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
     for _ in range(2):  # the second time it deviates already, or is asked in vain again
-        method._place(cloud, Labels(), generator(0))
+        method._place(cloud, Labels(), generator(0), "round-2")
     assert asked == [(18, 10)] * (1 if again else 2)  # a quarter judges, three fifths of the others
     assert method.template.deviates() == again
     assert len(method.pseudo.state) == (24 if again else 40)  # views are placed anew
@@ -446,4 +467,4 @@ def test_hinges_are_not_asked_again_where(why: str, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(TemplateRegistration, "_ask_deviation", unasked)
     monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
-    method._place(cloud, Labels(), generator(0))
+    method._place(cloud, Labels(), generator(0), "round-2")
