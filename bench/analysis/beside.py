@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
 from bench.analysis.reference import RECIPE, training_split, write_answers, write_reference
-from bench.requests import EvaluateRequest, Kind, ReferenceRequest, Request, Settings
+from bench.requests import EvaluateRequest, Kind, ReferenceRequest, Request, Settings, UsageError
 from bench.scoring.evaluate import evaluate, open_data
 from bench.scoring.score_files import SUFFIX, read_report
 from scapo.store import Split, StoreError, open_split, sha256_file
@@ -71,16 +71,16 @@ def write_references(request: ReferenceRequest) -> list[Path]:
     """Write what `reference` was asked for; returns the files.
 
     Raises:
-        ValueError: No place to write to, or one predictions file for two.
+        UsageError: No place to write to, or one predictions file for two.
         StoreError: No such data.
     """
     kind = request.kind
     if request.out is None and request.scores is None:
-        raise ValueError("reference: expected --out or --scores, found neither")
+        raise UsageError("reference: expected --out or --scores, found neither")
     written = []
     if request.out is not None:
         if kind == "both":
-            raise ValueError("--out: expected constant or oracle-pose, one file each, found both")
+            raise UsageError("--out: expected constant or oracle-pose, one file each, found both")
         write_reference(kind, request.data, request.category, request.out, split=request.split)
         written.append(request.out)
     if request.scores is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench.infer.calibration import Calibration, calibration_file, read_calibration
 from bench.methods import load
-from bench.requests import Mode
+from bench.requests import Mode, UsageError
 from scapo.categories import Category
 from scapo.predictor import Predictor
 from scapo.released import find, released
@@ -67,10 +67,11 @@ def load_models(run: Path | None, category: str | None, device: str, mode: Mode)
     """Those that are asked: of the run or the category, or every released one.
 
     Raises:
+        UsageError: Both are given.
         StoreError: There is none.
     """
     if run is not None and category is not None:
-        raise StoreError("--run, --category: expected one of the two or none, found both")
+        raise UsageError("--run, --category: expected one of the two or none, found both")
     if run is not None:
         return [load_model(run, device, mode)]
     weights = released()

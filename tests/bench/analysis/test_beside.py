@@ -186,7 +186,7 @@ def test_the_command_scores_references_alone(
     ):
         with pytest.raises(SystemExit) as ended:
             program.main(["reference", "both", *wrong])
-        assert ended.value.code == 1
+        assert ended.value.code == 2
         assert said in capsys.readouterr().err
     program.main(["reference", "both", *words, "--scores", str(tmp_path / "scores")])
     out = capsys.readouterr().out.splitlines()

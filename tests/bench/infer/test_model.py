@@ -9,6 +9,7 @@ import pytest
 
 from bench.infer import model as models
 from bench.infer.model import load_model, load_models
+from bench.requests import UsageError
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
@@ -39,7 +40,7 @@ def test_released_models_answer_by_category(tmp_path, monkeypatch):
         load_models(None, "laptop", "cpu", "fast")
     with pytest.raises(StoreError, match=r"--run RUN; did you mean 'oven'\?$"):
         load_models(None, "oevn", "cpu", "fast")
-    with pytest.raises(StoreError, match="expected one of the two or none, found both"):
+    with pytest.raises(UsageError, match="expected one of the two or none, found both"):
         load_models(Path("a"), "oven", "cpu", "fast")
 
 
