@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -28,6 +29,7 @@ from scapo.registered.template import Placement
 from scapo.registered.view_bank import ShownPoints
 from scapo.registered.view_network import ViewNetwork
 from scapo.registered.views import PartialViews
+from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.sighted import sighted, template
 from tests.helpers.strategies import generator
@@ -468,3 +470,29 @@ def test_hinges_are_not_asked_again_where(why: str, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(TemplateRegistration, "_ask_deviation", unasked)
     monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
     method._place(cloud, Labels(), generator(0), "round-2")
+
+
+def test_hinges_that_were_asked_again_are_not_asked_anew_after_an_interrupt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def leaning(start: Candidate, *_: object) -> Candidate:
+        made = start.template.with_points(400)
+        made.load.fill_(0.1)
+        return replace(start, template=made)
+
+    def made_again(*_: object) -> None:
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
+    monkeypatch.setattr(registered, "with_axis_deviation", leaning)
+    found = list[dict[str, Tensor]]()
+    for _ in range(2):
+        method, cloud = two_flaps(learned=True)
+        g = generator(5)
+        with StoredJournal(tmp_path, {"seed": 1}, "round-2", lambda *_: None) as journal:
+            method.journal = journal
+            method._place(cloud, Labels(), g, "round-2")
+        found.append({**method.state_dict(), "drawn": torch.rand(3, generator=g)})
+        for step in ("with_axis_deviation", "search_views"):  # what was kept is not made again
+            monkeypatch.setattr(registered, step, made_again)
+    assert_close(*found, rtol=0, atol=0)
