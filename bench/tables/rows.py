@@ -264,10 +264,12 @@ def _answered(counts: Counts) -> str:
 
     >>> _answered(Counts(samples=1000, instances=50, unanswered={"part_weight": 700}))
     '1000 samples, 300 of them answered'
+    >>> _answered(Counts(samples=5, instances=1, unanswered={"joint_axis": 0, "part_weight": 0}))
+    '5 samples'
     >>> _answered(Counts(samples=9, instances=3, unanswered={"joint_axis": 2, "part_weight": 1}))
     '9 samples, at most 7 of them answered'
     """
-    lacking = set(counts.unanswered.values())
+    lacking = {number for number in counts.unanswered.values() if number}
     if not lacking:
         return f"{counts.samples} samples"
     most = "at most " if len(lacking) > 1 else ""
