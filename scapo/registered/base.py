@@ -178,10 +178,11 @@ class AbstractRegistered(AbstractMethod):
         device = self.template.points.device
         self.cpu()
         self.eval()  # it is asked, and learns nothing yet
+        host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
+        self._revise(cloud, host)
         self.targets.clear()
         index = taught_rows(len(cloud), self._taught(), stage).to(cloud.device)
         cloud, labels = cloud[index].cpu(), map_tensors(take(labels, index), Tensor.cpu)
-        host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
         makers = {kind.__name__: kind for kind in (Candidates, Placement)}
         parts, total = list[Candidates](), len(index)
         jobs = [partial(self._candidates_of_all, some) for some in cloud.split(KEPT)]
@@ -194,6 +195,9 @@ class AbstractRegistered(AbstractMethod):
         self._hang(cloud, labels)
         self.network.learned.fill_(1.0)
         self.to(device)
+
+    def _revise(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
+        """Ask something of the template anew, of training clouds; on the host."""
 
     def _trusted(
         self, found: Candidates, cloud: Tensor, labels: Labels, generator: torch.Generator

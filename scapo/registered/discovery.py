@@ -23,6 +23,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from scapo.categories import JointKind
 from scapo.method import NO_JOURNAL, Journal, drawing, evenly
@@ -85,7 +87,7 @@ def discover(
     """
     plan = plan_of(config, kinds, len(views.points), len(objects))
     course = Course(kinds, generator, plan, journal)
-    judges, others = held_out(views, config.judged)
+    judges, others = (take(views, k) for k in held_out(len(views.points), config.judged))
     total = len(others.points)
     shown = None
     half: Searched = take(others, evenly(total, config.searched // 2))
@@ -115,12 +117,11 @@ def discover(
     return Discovery(template=best.template, found=found, scorer=scorer)
 
 
-def held_out(views: PartialViews, count: int) -> tuple[PartialViews, PartialViews]:
-    """Evenly spread views that judge, at most a quarter, and the others."""
-    total = len(views.points)
+def held_out(total: int, count: int) -> tuple[Int[Tensor, " J"], Int[Tensor, " K"]]:
+    """Views that judge, evenly spread and at most a quarter, and the others."""
     judges = evenly(total, min(count, total // JUDGES))
     rest = torch.ones(total, dtype=torch.bool).index_fill(0, judges, False)
-    return take(views, judges), take(views, rest.nonzero()[:, 0])
+    return judges, rest.nonzero()[:, 0]
 
 
 def _of_draws(

@@ -39,8 +39,8 @@ from scapo.registered.axis_deviation import square_axes, with_axis_deviation
 from scapo.registered.base import PLACED, PLACING, AbstractRegistered
 from scapo.registered.bundle_adjustment import Candidate, Inliers
 from scapo.registered.config import PRESETS, UNNAMED, RegisteredConfig, decided
-from scapo.registered.course import DEVIATION, JUDGES, VIEW, Course, are_alike, plan_of
-from scapo.registered.discovery import Discovery, discover
+from scapo.registered.course import DEVIATION, VIEW, Course, are_alike, plan_of
+from scapo.registered.discovery import Discovery, discover, held_out
 from scapo.registered.gauge import settle_hinges
 from scapo.registered.halves import cut_by_mirror
 from scapo.registered.learning import FIRST, candidates
@@ -137,35 +137,28 @@ class TemplateRegistration(AbstractRegistered):
             self.network.load_state_dict(known.network.state_dict())
         self._place(observation.points, labels, generator, stage)
 
-    def _place(self, cloud: Tensor, labels: Labels, generator: torch.Generator, stage: str) -> None:
-        """As `AbstractRegistered`, by a template whose hinges deviate if clouds now say so."""
-        asked = self.config.discovery.leans and self.config.teach == "all"
-        alike = are_alike(self.template.kinds) and "revolute" in self.template.kinds
-        known = isinstance(self.network, ViewNetwork) and bool(self.network.learned)
-        if asked and alike and known and not self.template.deviates():
-            device = self.template.points.device
-            self.cpu()
-            self.eval()
-            host = torch.Generator().manual_seed(0) if generator.device.type != "cpu" else generator
-            self._ask_deviation(cloud.cpu(), host)
-            self.to(device)
-        super()._place(cloud, labels, generator, stage)
-
-    def _ask_deviation(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
+    def _revise(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
         """Whether two alike hinges deviate, asked again of clouds that the network helps to place.
 
         Without it views are placed so much worse that the same objects are found to deviate by one
         draw and not by the next.
         """
+        asked = self.config.discovery.leans and self.config.teach == "all"
+        alike = are_alike(self.template.kinds) and "revolute" in self.template.kinds
+        if asked and alike and self._has_learned() and not self.template.deviates():
+            self._ask_deviation(cloud, generator)
+
+    def _ask_deviation(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
+        """Take a template whose hinges deviate, if it explains clouds far better."""
         kinds, learned = self.template.kinds, self.config.learned
         axes, search = "deviating axes again", "search of all views again"
         plan = {axes: DEVIATION + VIEW * LEANING, search: VIEW * learned}
         course = Course(kinds, generator, plan, self.journal)
-        asked = cloud[evenly(len(cloud), LEANING)]
+        asked = cloud[evenly(len(cloud), LEANING).to(cloud.device)].cpu()
         made = course.step(axes, partial(self._deviating, asked, generator))
         if not made.template.deviates():
             return
-        cloud = cloud[evenly(len(cloud), learned)]
+        cloud = cloud[evenly(len(cloud), learned).to(cloud.device)].cpu()
         _, views, self.pseudo.belonging = self._observed(cloud)
         searching = partial(search_views, made, views, self.orientation, self.journal)
         found = course.step(search, searching)
@@ -174,11 +167,10 @@ class TemplateRegistration(AbstractRegistered):
 
     def _deviating(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> Candidate:
         """The template, fitted to clouds as `quick` places them if its hinges deviate."""
-        config, total = self.config.discovery, len(cloud)
+        config = self.config.discovery
         jobs = [partial(self._placed, some) for some in cloud.split(PLACED)]
         found = cat([job() for job in self.journal.ahead(jobs)])
-        views, judges = self._observed(cloud)[1], evenly(total, min(config.judged, total // JUDGES))
-        others = torch.ones(total, dtype=torch.bool).index_fill(0, judges, False).nonzero()[:, 0]
+        views, (judges, others) = self._observed(cloud)[1], held_out(len(cloud), config.judged)
         sure = others[most_confident(take(found, others), SURE)]
         inliers = Inliers(views=take(views, sure), placement=take(found.placement, sure))
         start = Candidate(template=self.template, inliers=inliers)

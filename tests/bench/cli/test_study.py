@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bench import __main__ as program
-from bench.analysis.study_page import PAGE
+from bench.analysis.study_page import PAGE, Entry
 from bench.requests import Request, StudyRequest
 from bench.runs import study
 from bench.runs.predict import joined
@@ -75,11 +76,19 @@ def test_another_question_is_answered_anew(tmp_path, monkeypatch) -> None:
 
     for name in ("predict", "evaluate_beside", "measure_stability"):
         monkeypatch.setattr(study, name, lambda request, *_: make(request))
+
+    def below(file: str, request: Request) -> tuple[()]:
+        make(replace(request, out=request.out / file))
+        return ()
+
     for name, file in (("explain", "ladder.md"), ("draw_pictures", "ranking.png")):
-        below = lambda request, file=file: make(replace(request, out=request.out / file)) or ()  # noqa: E731
-        monkeypatch.setattr(study, name, below)
+        monkeypatch.setattr(study, name, partial(below, file))
     told: list[Path | None] = []
-    page = lambda out, entries, *_: told.extend(one.stability for one in entries) or out  # noqa: E731
+
+    def page(out: Path, entries: list[Entry], *_: object) -> Path:
+        told.extend(one.stability for one in entries)
+        return out
+
     monkeypatch.setattr(study, "write_page", page)
 
     def asked(

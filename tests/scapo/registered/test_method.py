@@ -442,9 +442,8 @@ def test_once_the_network_helps_to_place_clouds_two_hinges_are_asked_again_wheth
         return replace(start, template=made)
 
     monkeypatch.setattr(registered, "with_axis_deviation", leaning)
-    monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
     for _ in range(2):  # the second time it deviates already, or is asked in vain again
-        method._place(cloud, Labels(), generator(0), "round-2")
+        method._revise(cloud, generator(0))
     assert asked == [(18, 10)] * (1 if again else 2)  # a quarter judges, three fifths of the others
     assert method.template.deviates() == again
     assert len(method.pseudo.state) == (24 if again else 40)  # views are placed anew
@@ -468,8 +467,7 @@ def test_hinges_are_not_asked_again_where(why: str, monkeypatch: pytest.MonkeyPa
         raise AssertionError("asked")
 
     monkeypatch.setattr(TemplateRegistration, "_ask_deviation", unasked)
-    monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
-    method._place(cloud, Labels(), generator(0), "round-2")
+    method._revise(cloud, generator(0))
 
 
 def test_hinges_that_were_asked_again_are_not_asked_anew_after_an_interrupt(
@@ -483,7 +481,6 @@ def test_hinges_that_were_asked_again_are_not_asked_anew_after_an_interrupt(
     def made_again(*_: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr(AbstractRegistered, "_place", lambda *_: None)
     monkeypatch.setattr(registered, "with_axis_deviation", leaning)
     found = list[dict[str, Tensor]]()
     for _ in range(2):
@@ -491,7 +488,7 @@ def test_hinges_that_were_asked_again_are_not_asked_anew_after_an_interrupt(
         g = generator(5)
         with StoredJournal(tmp_path, {"seed": 1}, "round-2", lambda *_: None) as journal:
             method.journal = journal
-            method._place(cloud, Labels(), g, "round-2")
+            method._revise(cloud, g)
         found.append({**method.state_dict(), "drawn": torch.rand(3, generator=g)})
         for step in ("with_axis_deviation", "search_views"):  # what was kept is not made again
             monkeypatch.setattr(registered, step, made_again)
