@@ -299,8 +299,9 @@ class GridRequest:
     preset: tyro.conf.Positional[Literal["smoke", "cpu", "paper"]]
     """smoke: three methods on a few ovens, under three minutes; cpu: every table with the lean
     presets; paper: with the published sizes, for GPUs."""
-    out: Path
-    """Folder for plan.json, runs/, predictions/, scores/, tables/ and jobs/ (records and logs)."""
+    out: Path | None = None
+    """Folder for plan.json, runs/, predictions/, scores/, tables/ and jobs/ (records and logs); by
+    default results/runs/PRESET."""
     data: Path | None = None
     """Folder of the data, PART/CATEGORY/SPLIT; by default OUT/data. What is missing is made by
     scapo-data."""

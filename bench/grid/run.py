@@ -19,6 +19,8 @@ from bench.requests import GridRequest
 from scapo.store import StoreError
 
 LOCK = ".lock"
+RUNS = Path("results/runs")
+"""Where runs go unless told otherwise, a folder for each preset."""
 DATA_SEED = 2
 """Of data made here, as the benchmark's."""
 MADE = ("clean", "complete", "sensor")
@@ -83,9 +85,9 @@ class Grid:
             raise ValueError(f"--gpus: expected a share of one or a whole number, found "
                              f"{request.gpus}")  # fmt: skip
         self.request, self.presets = request, presets
-        self.data = request.data or request.out / "data"
+        self.out = request.out or RUNS / request.preset
+        self.data = request.data or self.out / "data"
         self.machines = Machines(engine=request.engine, workers=request.workers, gpus=request.gpus)
-        self.out = request.out
 
     def plan(self, say: Callable[[str], None]) -> tuple[Plan, list[Chain]]:
         """The plan, written or held against the one that is there, and the chains asked for.

@@ -99,6 +99,14 @@ def test_missing_data_are_asked_for(folder: Path, monkeypatch):
     ]
 
 
+def test_a_run_has_a_folder_of_its_own_unless_told(folder: Path, monkeypatch):
+    make_splits(folder)
+    monkeypatch.chdir(folder)
+    run.Grid(GridRequest(preset="smoke", data=folder / "data")).plan(lambda line: None)
+    assert (folder / "results" / "runs" / "smoke" / "plan.json").is_file()
+    assert run.Grid(GridRequest(preset="cpu")).data == Path("results/runs/cpu/data")
+
+
 def test_one_run_at_a_time_in_a_folder(folder: Path):
     make_splits(folder)
     (folder / "out").mkdir()
