@@ -455,7 +455,7 @@ class AbstractRegistered(AbstractMethod):
             if said is None:
                 return found
             charged = replace(found, unlike=found.unlike + BETTER)
-            return charged.with_others(self._settled(seen, said, 0, OWN))
+            return charged.with_others(self._settled(seen, said, 0, OWN)).bounded()
         alone = learned and seen.up is None  # what the network had upside down is looked for
         beside = config.quick_beside if alone else config.quick_hypotheses
         return self._settled(seen, said, beside, BRIEF if beside else of_one(self.template))

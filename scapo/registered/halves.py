@@ -59,9 +59,10 @@ Of ovens' doors 0.31 to 0.42 come of it, with the ceiling in the end, and they a
 the body. Laptops, scissors and suitcases have 0.40 to 0.52 and 0.030 to 0.044."""
 PLANES = 72  # Through the axis in which a half may be the other's mirror image
 SURENESS = 6.0  # Logit of the half that a point begins in
-SAME, CLEARER = 0.8, 0.75
+SAME, CLEARER, MIRRORED = 0.8, 0.75, 0.03
 """Share of the points that a mirror plane has to leave where they are, and how unlike halves may be
-that it cuts, over those that are there: of suitcases 0.85 and 0.6, of scissors 0.72 or 0.9."""
+that it cuts, over those that are there and by themselves: of suitcases 0.85, 0.6 and 0.018, of
+scissors 0.72 or 0.9. Boxes of safes may be cut through the hinge to 0.8, 0.6 and 0.042."""
 ASIDE, REACH, PLACES_ASIDE, BORDER = 0.15, 0.15, 31, 0.03
 """Normalised lengths: how far beside the hinge planes lie that are tried, and along them hinges, of
 so many places; from the plane to where a point is surely of one half."""
@@ -117,33 +118,34 @@ def cut_by_mirror(template: ArticulatedTemplate, placement: Placement) -> Placem
     Two shells that meet at a hinge lie on either side of a plane through it, at any state. But near
     the hinge a part moves little: of suitcases a strip of one shell went to the other, with the
     hinge at its far end. The plane along the axis in which the points on either side are mirror
-    images says it better. It has to be clearly better than the parts as they are, and to leave most
-    points where they are: halves of scissors cross each other, the base of a laptop reaches beyond
-    its hinge.
+    images says it better. It has to make two halves that are much alike, clearly more so than the
+    parts as they are, and to leave most points where they are: halves of scissors cross each other,
+    the base of a laptop reaches beyond its hinge. How large the parts were says nothing: strips
+    left 0.38 to one half of suitcases.
 
     Args:
-        template: Of two like halves, as it was cut (`alike`) or as it came; others stay as they
-            are.
+        template: With a hinge and two parts; others stay as they are.
         placement: Of the views that it was fitted to.
 
     Returns:
         The same motions as turns about the new hinge, which is where on the plane they leave the
         least shift, with the shifts that are left.
     """
-    if not (bool(template.alike) or are_halves(template)):
+    if not may_have_halves(template):
         return placement
     seen, part = _seen_along(template), template.logit.argmax(-1)
-    best, found = CLEARER * unlikeness(template), None
+    best, found = MIRRORED, None
     for normal in _normals(seen):
         for place in torch.linspace(-ASIDE, ASIDE, PLACES_ASIDE).tolist():
             beyond = seen @ normal > place
+            share = float(beyond.float().mean())
             same = float((beyond == (part == 1)).float().mean())
-            if max(same, 1 - same) < SAME:
+            if max(same, 1 - same) < SAME or not LEAST_HALF <= share <= 1 - LEAST_HALF:
                 continue
             unlike = _unlike(seen[~beyond], seen[beyond], normal, place)
             if unlike < best:
                 best, found = unlike, (normal, place) if same > 0.5 else (-normal, -place)
-    if found is None:
+    if found is None or best >= CLEARER * unlikeness(template):
         return placement
     normal, place = found
     side = ((seen @ normal - place) / BORDER).clamp(-1, 1) * SURENESS / 2

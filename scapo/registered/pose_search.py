@@ -47,6 +47,9 @@ RIVAL = 30.0  # Degrees from the best placement from which on another is its riv
 NO_RIVAL = 2.0  # Loss in place of a rival's where there is none: about the largest there is
 AGAIN = 120.0  # Sharpness of the loss by which states are tried again before the last steps
 AGAIN_EVERY = 3  # Of the points, one in so many enters it
+UNEXPLAINED = 0.6
+"""Loss beyond which nobody has explained a view (such as one with background in its mask): by how
+much says nothing of hypotheses. Answers of doors have 0.1 to 0.4, of thin blades 0.2 to 0.7."""
 RUNG_APART = 12.0  # Degrees between hypotheses that go on
 
 
@@ -185,6 +188,11 @@ class Hypotheses:
             loss=torch.cat([self.loss, others.loss], 1),
             unlike=torch.cat([self.unlike, others.unlike], 1),
         )
+
+    def bounded(self) -> Hypotheses:
+        """The same, chosen by no more of each loss than `UNEXPLAINED`."""
+        beyond = (self.loss - UNEXPLAINED).clamp_min(0)
+        return replace(self, unlike=self.unlike - beyond)
 
     def rotation(self) -> Float[Tensor, "B F 3 3"]:
         """view_R_template of all."""

@@ -187,17 +187,19 @@ def test_two_parts_with_a_hinge_may_be_halves(kinds: tuple[JointKind, ...], may:
 
 
 @torch.no_grad()
-def shells(count: int, *, open_by: float, reach: float = 0.0) -> tuple[ArticulatedTemplate, Tensor]:
+def shells(
+    count: int, *, open_by: float, reach: float = 0.0, strip: float = 0.01
+) -> tuple[ArticulatedTemplate, Tensor]:
     """Two shells with walls at their hinge, x = 0.25, and which half each point truly is.
 
-    The other half's wall up to `reach` from the hinge is taken for the first one's, and the hinge
-    lies there.
+    A strip of the other half at that wall, up to `reach` from the hinge, is taken for the first
+    one's, and the hinge lies at its end.
     """
     g = generator(7)
     points, normals = box(torch.tensor([0.25, 0.15, 0.06]), count, g)
     half = torch.rand(count, generator=g) < 0.5
     points[:, 2] += 0.06 - 0.12 * half
-    taken = half.logical_not() | ((points[:, 0] > 0.24) & (points[:, 2] > -reach))
+    taken = half.logical_not() | ((points[:, 0] > 0.25 - strip) & (points[:, 2] > -reach))
     hinge = torch.tensor([0.25, 0.0, 0.0])
     turn = rotvec_to_rotmat(torch.tensor([0.0, open_by, 0.0]))
     points[half] = (points[half] - hinge) @ turn.T + hinge
@@ -213,8 +215,12 @@ def shells(count: int, *, open_by: float, reach: float = 0.0) -> tuple[Articulat
 
 def test_shells_are_cut_where_they_mirror_each_other_and_motions_stay():
     angle = torch.linspace(-0.9, 0.6, 8)[:, None]
-    for reach, swapped, told in ((0.07, False, True), (0.07, True, False), (0.0, False, True)):
-        made, half = shells(1600, open_by=-1.0, reach=reach)
+    for reach, strip, swapped, told in (
+        (0.07, 0.01, False, True), (0.07, 0.01, True, False), (0.0, 0.01, False, True),
+        (0.13, 0.09, False, False),
+    ):  # fmt: skip
+        made, half = shells(1600, open_by=-1.0, reach=reach, strip=strip)
+        assert are_halves(made) == (strip < 0.05)
         made.alike.fill_(float(told))  # as a template is that came so without being cut in two
         if swapped:
             made.logit.data = made.logit.data.flip(-1)

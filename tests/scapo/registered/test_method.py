@@ -158,17 +158,21 @@ def test_the_network_is_asked_where_it_learned_and_the_banks_where_not():
     assert not torch.allclose(plain.part_weight, found.part_weight, atol=1e-3)
 
 
-@pytest.mark.parametrize(("loss", "first"), [(0.28, False), (0.26, True)])
+@pytest.mark.parametrize(
+    ("own", "loss", "first"),
+    [(0.3, 0.28, False), (0.3, 0.26, True), (1.6, 0.5, True), (1.6, 0.9, False)],
+)
 def test_refine_leaves_the_word_of_the_network_for_what_is_clearly_better(
-    loss: float, first: bool, monkeypatch: pytest.MonkeyPatch
+    own: float, loss: float, first: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Not for what explains a view badly, too, however much worse the network's does."""
     method, observation = trained(0)
     _, truth = sighted(12, seed=60)
     turned = replace(truth, rotation=truth.rotation @ random_rotations(1, generator(3))[0])
 
     def settled(seen: SeenClouds, said: Said | None, beside: int, by: Effort) -> Hypotheses:
         del seen, said, by
-        placement, cost = (turned, loss) if beside else (truth, 0.3)
+        placement, cost = (turned, loss) if beside else (truth, own)
         none = torch.zeros(12, 1)
         return Hypotheses(placement=placement, loss=none + cost, unlike=none)
 
