@@ -38,7 +38,7 @@ class DataOptions:
     """Number of samples."""
     instances: int | None = None
     """Number of objects that they show; default: one for each 50 samples, or all models of the
-    folder. Each shows count / instances samples, rounded up, so that the last may go without."""
+    folder. Each shows count / instances samples, rounded up, unless the last would go without."""
     seed: Seed = 1
     """Seed of objects, joint states, cameras and points."""
     points: int = 1024

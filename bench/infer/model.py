@@ -67,7 +67,7 @@ def load_models(run: Path | None, category: str | None, device: str, mode: Mode)
     """Those that are asked: of the run or the category, or every released one.
 
     Raises:
-        UsageError: Both are given.
+        UsageError: Both are given, or no model of that category is released.
         StoreError: There is none.
     """
     if run is not None and category is not None:
@@ -77,7 +77,7 @@ def load_models(run: Path | None, category: str | None, device: str, mode: Mode)
     weights = released()
     if category is not None and category not in weights:
         known = f"one of {', '.join(weights)}" if weights else "none, as no model is released yet"
-        raise StoreError(
+        raise UsageError(
             f"--category {category}: expected {known}; a run of your own is given by --run RUN"
             f"{did_you_mean(category, weights)}"
         )

@@ -12,16 +12,18 @@ from typing import Any
 import torch
 
 from bench.methods import all_methods
-from bench.requests import TrainRequest
+from bench.requests import TrainRequest, UsageError
 from bench.run_files import TIMING
 from bench.runs.align import align
 from bench.runs.report import REPORT, write_report
-from scapo.categories import category
+from scapo.categories import CATEGORIES
+from scapo.method import AbstractMethod
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.definitions import category_of
 from scapo.store.samples import TrainingData, read_training_data
 from scapo.store.schema import StoreError
+from scapo.text import unknown_word
 from scapo.training import fit
 from scapo.training.distributed import joined, own_device
 from scapo.training.precision import Arithmetic
@@ -75,6 +77,7 @@ def _fit(
     method = methods[name].build(request.method, kind, generator)
     if method.name != name:
         raise ValueError(f"{name}: expected a method of that name, found {method.name}")
+    _check_points(method, split)
     precision = Arithmetic(precision=request.precision, compiled=request.compile, tf32=request.tf32)
     config = fit.FitConfig(
         seed=request.seed,
@@ -93,7 +96,7 @@ def _fit(
         )
     data = read_training_data(split)
     if any(stage.validate_every for stage in method.stages()):
-        data = replace(data, validation=_validation(request))
+        data = replace(data, validation=_validation(request, method))
     logging.getLogger("scapo").setLevel(logging.WARNING if say is None else logging.INFO)
     shown = fit.silent if say is None else listener
     fit.fit(method, data, request.out, config, resume=request.resume, listener=shown)
@@ -104,21 +107,38 @@ def _training_split(request: TrainRequest[Any]) -> Split:
 
     Raises:
         StoreError: The data have none of that category.
-        ValueError: Neither have they, nor is there such a category.
+        UsageError: Neither have they, nor is there such a category.
     """
     try:
         return open_split(request.data, request.category, request.split)
-    except StoreError:
-        category(request.category)  # a name that nobody knows is the likelier mistake
-        raise
+    except StoreError as error:
+        if request.category in CATEGORIES:
+            raise
+        said = unknown_word("category", request.category, CATEGORIES)  # the likelier mistake
+        raise UsageError(said) from error
 
 
-def _validation(request: TrainRequest[Any]) -> TrainingData | None:
+def _check_points(method: AbstractMethod, split: Split) -> None:
+    """Refuse clouds that the method could not answer either, before any work.
+
+    Raises:
+        ValueError: They have fewer points than it needs.
+    """
+    found = split.manifest.points
+    if found < method.least_points:
+        raise ValueError(
+            f"{split.folder}: expected clouds of {method.least_points} points or more, as "
+            f"{method.name} needs with these flags, found {found}"
+        )
+
+
+def _validation(request: TrainRequest[Any], method: AbstractMethod) -> TrainingData | None:
     """The split for validation, where the data have it."""
     try:
         split = open_split(request.data, request.category, request.val_split)
     except StoreError:
         return None
+    _check_points(method, split)
     return read_training_data(split)
 
 

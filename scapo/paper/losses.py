@@ -182,11 +182,13 @@ def joint_proximity(
 ) -> Scalar:
     """L_joint-prox (Sec. 3.3): 1 - exp(-lambda_prox E_j[min_i |c_j - s_i|^2]).
 
-    `neighbours` = 8 gives OP-Align's form, the squared mean distance of the 8 nearest points. The
-    printed expectation is over p of a term in j; joints are meant. `detach`: points are constants.
+    `neighbours` = 8 gives OP-Align's form, the squared mean distance of the 8 nearest points, of
+    all where there are fewer. The printed expectation is over p of a term in j; joints are meant.
+    `detach`: points are constants.
     """
     points = points.detach() if detach else points
-    near = k_nearest(pivot.detach(), points.detach(), neighbours)  # (B, J, k)
+    most = min(neighbours, points.shape[1])
+    near = k_nearest(pivot.detach(), points.detach(), most)  # (B, J, k)
     chosen = gather(points, near.flatten(1)).unflatten(1, near.shape[1:])
     square = (pivot[:, :, None] - chosen).square().sum(-1)
     if neighbours > 1:

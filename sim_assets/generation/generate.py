@@ -16,6 +16,7 @@ from typing import Any
 from scapo.categories import Category
 from scapo.parallel.pool import AbstractPool, Outcome
 from scapo.parallel.ray import Engine, open_pool
+from scapo.store import SAMPLES, read_header
 from scapo.store.manifest import Manifest, Shard, shards_digest
 from sim_assets.describe.card import CARD, write_card
 from sim_assets.generation.assets import Asset
@@ -205,7 +206,7 @@ def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Ru
     kept = {
         job.plan.file: work.finished[job.plan.file]
         for job in jobs
-        if job.plan.file in work.finished
+        if job.plan.file in work.finished and _cut_alike(job)
     }
     made = _render(ledger, pool, [job for job in jobs if job.plan.file not in kept], running)
     shards = [{**kept, **made}[job.plan.file] for job in jobs]
@@ -217,6 +218,13 @@ def _make(ledger: Ledger, pool: AbstractPool[Any, Any], work: _Work, running: Ru
     ledger.finish(manifest, [shard.file for shard in shards if not shard.count])
     write_card(ledger.folder)
     return Made(folder=ledger.folder, manifest=manifest, failed=manifest.left_out, kept=len(kept))
+
+
+def _cut_alike(job: ShardJob) -> bool:
+    """Whether the shard that is there was planned as this one; older versions rounded otherwise."""
+    name = "samples_per_instance"
+    made = read_header(job.folder / job.plan.file, SAMPLES).get("options", {})
+    return made.get(name) == job.options[name]
 
 
 def _describe(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What a split will hold: objects, samples per object, shards; a function of the request alone.
 
-Sample i shows instance i // samples_per_instance. Its generator is seeded by source, category,
-split, seed and view number, so neither workers nor interruptions nor shards change it.
+Sample i shows instance (i // samples_per_instance) % instances. Its generator is seeded by source,
+category, split, seed and view number, so neither workers nor interruptions nor shards change it.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Piece:
-    """Consecutive views of one object."""
+    """Consecutive views of one object; an object may have several."""
 
     entry: Entry
     index: int
@@ -113,14 +113,22 @@ class ShardPlan:
 
 
 def samples_per_instance(request: Request, instances: int) -> int:
-    """ceil(count / instances), rounded up to whole views."""
+    """Consecutive samples of an instance: count / instances in whole views.
+
+    Rounded up, so that the last has fewer; where that would leave some without any, rounded down,
+    and the first ones come again.
+    """
     states = request.settings.states_per_view
-    return math.ceil(request.count / states / instances) * states
+    views = request.count // states
+    each = math.ceil(views / instances)
+    if math.ceil(views / each) < instances:
+        each = max(1, views // instances)
+    return each * states
 
 
 def used_instances(request: Request, instances: int) -> int:
-    """How many of the instances get samples: rounding up can leave the last ones without."""
-    return math.ceil(request.count / samples_per_instance(request, instances))
+    """How many of the instances get samples: all, unless they are more than the views."""
+    return min(instances, request.count // request.settings.states_per_view)
 
 
 def plan_shards(request: Request, entries: Sequence[Entry], instances: int) -> list[ShardPlan]:
@@ -143,8 +151,9 @@ def plan_shards(request: Request, entries: Sequence[Entry], instances: int) -> l
     for number, first in enumerate(range(0, request.count, size)):
         last = min(first + size, request.count)
         pieces = []
-        for index in range(first // each, (last - 1) // each + 1):
-            low, high = max(first, index * each), min(last, (index + 1) * each)
+        for run in range(first // each, (last - 1) // each + 1):
+            low, high = max(first, run * each), min(last, (run + 1) * each)
+            index = run % len(entries)
             piece = Piece(
                 entry=entries[index],
                 index=index,

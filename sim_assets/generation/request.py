@@ -47,7 +47,8 @@ def make_request(
         assets = procedural_assets(kind.name, options.split, options.seed, instances)
     else:
         assets = _models(kind, options) if models is None else list(models)
-        instances = options.instances or min(len(assets), options.count)
+        views = options.count // options.states_per_view
+        instances = options.instances or min(len(assets), views)
     given = {name: getattr(options, name) for name in ("up", "front", "scale")}
     given["any_model"] = options.any_model or None
     request = Request(
@@ -158,14 +159,16 @@ def _check(options: DataOptions) -> None:
     for name, value, maximum in most:
         if value is not None and value > maximum:
             raise ValueError(f"{name}: expected {maximum} or less, found {value}")
-    if options.instances is not None and options.instances > options.count:
-        raise ValueError(
-            f"instances: expected at most count, {options.count}, found {options.instances}"
-        )
     if options.count % options.states_per_view:
         raise ValueError(
             f"count: expected a multiple of states_per_view, {options.states_per_view}, found "
             f"{options.count}"
+        )
+    views = options.count // options.states_per_view
+    if options.instances is not None and options.instances > views:
+        raise ValueError(
+            f"instances: expected at most {views}, the views that count gives, found "
+            f"{options.instances}"
         )
     wanted = options.up, options.front, options.scale
     asked = options.any_model or any(value is not None for value in wanted)

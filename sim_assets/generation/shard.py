@@ -67,7 +67,7 @@ def render_piece(
 def render_pieces(
     request: Request, pieces: Sequence[Piece], renderer: AbstractParallelRenderer, report: Report
 ) -> dict[int, list[RenderedView] | Exception]:
-    """Views of several objects at once, by the piece's index.
+    """Views of several objects at once, by the piece's first view.
 
     Those that are not in the answer were not shown because the renderer failed: they may be tried
     one by one.
@@ -77,7 +77,7 @@ def render_pieces(
     for piece in pieces:
         thing = _try_load(piece, report)
         if isinstance(thing, Exception):
-            made[piece.index] = thing
+            made[piece.first] = thing
         else:
             shown.append((piece, SampleMaker(None, thing, request.settings)))
     if not shown:
@@ -102,7 +102,7 @@ def render_pieces(
         return made
     for (piece, _), group in zip(shown, groups, strict=True):
         errors = [batch.error for batch in group if batch.error is not None]
-        made[piece.index] = (
+        made[piece.first] = (
             errors[0] if errors else [view for batch in group for view in batch.rendered]
         )
     return made
@@ -231,8 +231,8 @@ def _results(
     for piece in job.plan.pieces:
         if piece.entry.instance.id in job.skip:
             yield piece, RuntimeError(job.skip[piece.entry.instance.id])
-        elif piece.index in made:
-            yield piece, made[piece.index]
+        elif piece.first in made:
+            yield piece, made[piece.first]
         else:
             yield piece, _try_piece(job.request, piece, renderer, report)
 
@@ -242,7 +242,7 @@ def _try_piece(
 ) -> list[RenderedView] | Exception:
     try:
         if isinstance(renderer, AbstractParallelRenderer):
-            return render_pieces(request, [piece], renderer, report)[piece.index]
+            return render_pieces(request, [piece], renderer, report)[piece.first]
         return render_piece(request, piece, renderer, report)
     except Exception as error:  # noqa: BLE001 - whatever it is, it costs this object only
         return error

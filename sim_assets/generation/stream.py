@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
+from itertools import cycle
 from typing import Any
 
 import torch
@@ -30,13 +31,12 @@ def stream(category: str | Category, **options: Any) -> Iterator[Sample]:  # noq
 def _samples(request: Request, assets: Sequence[Asset]) -> Iterator[Sample]:
     settings = request.settings
     each = samples_per_instance(request, len(assets))
+    runs = range(0, request.count, each)
     backend = settings.backend
     opened = nullcontext() if backend is None else make_renderer(backend, color=settings.color)
     with opened as renderer:
-        for number, asset in enumerate(assets):
-            first, last = number * each, min((number + 1) * each, request.count)
-            if first >= last:
-                return
+        for first, asset in zip(runs, cycle(assets), strict=False):
+            last = min(first + each, request.count)
             states = settings.states_per_view
             maker = SampleMaker(renderer, asset.load(), settings)
             keys = [request.key(view) for view in range(first // states, last // states)]

@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from scapo.drawing import BACKGROUND, PART_COLORS
 from scapo.store import Split
+from scapo.store.files import tensor_names
 from scapo.store.manifest import Manifest
 from scapo.store.schema import UNLABELLED
 from scapo.text import one_line
@@ -150,7 +151,9 @@ class Viewer:
         with self.lock:
             self.split = self.splits[self.split_box.value]
             manifest = self.split.manifest
-            colored = bool(manifest.options.get("color"))
+            shards = manifest.shards
+            names = tensor_names(self.split.folder / shards[0].file) if shards else set()
+            colored = "color" in names
             self.samples = self.split.arrays(*SHOWN, *(["color"] if colored else []))
             self.paint_box.disabled = not colored and self._answers() is None
             if self.sample_box is not None:

@@ -36,9 +36,9 @@ def test_released_models_answer_by_category(tmp_path, monkeypatch):
     assert [m.name for m in load_models(None, None, "cpu", "fast")] == ["oven", "safe"]
     (found,) = load_models(None, "safe", "cpu", "fast")
     assert found.category.name == "safe"
-    with pytest.raises(StoreError, match="--category laptop: expected one of oven, safe; a run"):
+    with pytest.raises(UsageError, match="--category laptop: expected one of oven, safe; a run"):
         load_models(None, "laptop", "cpu", "fast")
-    with pytest.raises(StoreError, match=r"--run RUN; did you mean 'oven'\?$"):
+    with pytest.raises(UsageError, match=r"--run RUN; did you mean 'oven'\?$"):
         load_models(None, "oevn", "cpu", "fast")
     with pytest.raises(UsageError, match="expected one of the two or none, found both"):
         load_models(Path("a"), "oven", "cpu", "fast")
@@ -46,7 +46,7 @@ def test_released_models_answer_by_category(tmp_path, monkeypatch):
 
 def test_without_released_models_a_run_is_asked_for(monkeypatch):
     monkeypatch.setattr(models, "released", dict)
-    with pytest.raises(StoreError, match="no model is released yet; a run of your own"):
+    with pytest.raises(UsageError, match="no model is released yet; a run of your own"):
         load_models(None, "oven", "cpu", "fast")
     with pytest.raises(StoreError, match="found none yet: give one of your own with --run RUN"):
         load_models(None, None, "cpu", "fast")

@@ -197,16 +197,25 @@ def test_bad_input_is_one_line(
     assert "expected laptop/wrong" in fails(
         capsys, "predict", run, "--data", data, *out, "--split", "wrong"
     )
-    assert "expected one of laptop" in fails(
-        capsys, "train", "scapo", "--category", "teapot", "--data", data, *out
-    )
+    assert "expected clouds of 300 points or more, as scapo needs with these flags, found" in fails(
+        capsys, "train", "scapo", *("--category", "laptop", "--data", data, *out),
+        *("--preset", "cpu", "--encoder.neighbours", 300),
+    )  # fmt: skip
     assert "--device cuda:99: expected a device of this machine" in fails(
         capsys, "predict", run, "--data", data, *out, "--device", "cuda:99"
     )
 
 
-def test_wrong_usage_ends_with_two() -> None:
-    for words in (["train"], ["train", "none"], ["train", "scapo", "--bogus", "1"], ["predict"]):
+def test_wrong_usage_ends_with_two(data: Path, tmp_path: Path) -> None:
+    teapot = ["--category", "teapot", "--out", str(tmp_path / "out")]
+    for words in (
+        ["train"],
+        ["train", "none"],
+        ["train", "scapo", "--bogus", "1"],
+        ["train", "icp", *teapot, "--data", str(data)],
+        ["infer", str(tmp_path / "cloud.ply"), *teapot],
+        ["predict"],
+    ):
         with pytest.raises(SystemExit) as caught:
             command(*words)
         assert caught.value.code == 2

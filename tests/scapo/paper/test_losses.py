@@ -135,6 +135,8 @@ def test_proximity_is_zero_on_the_shape_and_saturates_away_from_it() -> None:
     assert losses.joint_proximity(t([[0, 0, 5]]), SQUARE).item() == pytest.approx(1)
     four = losses.joint_proximity(t([[0.5, 0.5, 0]]), SQUARE, neighbours=4)
     assert four.item() == pytest.approx(1 - math.exp(-30 * 0.5))
+    more = losses.joint_proximity(t([[0.5, 0.5, 0]]), SQUARE, neighbours=40)
+    assert more.item() == four.item()  # as many as there are, at the end of a long first stage
     both = losses.joint_proximity(t([[0, 0, 0.1], [0, 0, 0]]), SQUARE)
     assert both.item() == pytest.approx(1 - math.exp(-0.15))
 

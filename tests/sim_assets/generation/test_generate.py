@@ -9,14 +9,14 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from scapo.store import Split, open_split
-from scapo.store.manifest import read_manifest
+from scapo.store import SAMPLES, Split, open_split, read, write
+from scapo.store.manifest import read_manifest, shards_digest
 from sim_assets import generate_samples
 from sim_assets.__main__ import main
 from sim_assets.generation.assets import ProceduralAsset
@@ -103,6 +103,29 @@ def test_workers_do_not_change_the_bytes_and_streaming_gives_the_same(tmp_path):
         assert np.array_equal(pose.numpy(), data["camera_T_part"][i])
         assert np.array_equal(sample.visible.numpy(), data["visible"][i])
     check_plan_digest_of_the_other_backend(made[0], tmp_path)
+
+
+def test_every_object_is_shown_where_rounding_up_would_leave_some_out(tmp_path):
+    """Streamed too; a shard that was cut otherwise, as by older versions, is made anew."""
+    options = replace(FULL, count=80, instances=60)
+    request, assets = make_request("laptop", options)
+    made = generate(request, assets, tmp_path / "split", VERSIONS, HERE)
+    split = Split(made.folder)
+    shown = split.arrays("instance")["instance"]
+    assert shown.tolist() == [*range(60), *range(20)]
+    names = [record.id for record in split.manifest.instances]
+    streamed = [s.key.instance for s in generate_samples("laptop", **asdict(options))]
+    assert streamed == [names[index] for index in shown]
+    before, shard = content(made.folder), made.folder / split.manifest.shards[0].file
+    arrays, header = read(shard, SAMPLES)
+    header["options"]["samples_per_instance"] = 2
+    changed = replace(split.manifest.shards[0], sha256=write(shard, arrays, header))
+    shards = (changed, *split.manifest.shards[1:])
+    other = replace(split.manifest, shards=shards, digest=shards_digest(shards))
+    (made.folder / "manifest.json").write_text(other.to_json())
+    (made.folder / shards[1].file).unlink()
+    assert generate(request, assets, made.folder, VERSIONS, HERE).kept == 0
+    assert content(made.folder) == before
 
 
 def check_plan_digest_of_the_other_backend(made: Made, tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_shards_hold_every_sample_once_in_order(views, instances, states):
     instances = min(instances, views)
     each = samples_per_instance(wanted, instances)
     used = used_instances(wanted, instances)
-    assert used <= instances
+    assert used == instances  # none goes without
     shards = plan_shards(wanted, entries(used), instances)
     sample = 0
     for number, shard in enumerate(shards):
@@ -79,11 +79,27 @@ def test_shards_hold_every_sample_once_in_order(views, instances, states):
         for piece in shard.pieces:
             for view in range(piece.first, piece.first + piece.views):
                 assert view * states == sample
-                assert piece.index == sample // each
+                assert piece.index == sample // each % used
                 sample += states
         assert sample == shard.first + shard.count
     assert sample == wanted.count
     assert {piece.index for shard in shards for piece in shard.pieces} == set(range(used))
+
+
+@pytest.mark.parametrize(
+    ("views", "instances", "each", "shown"),
+    [(640, 13, 50, [50] * 12 + [40]), (22, 10, 2, [4, *[2] * 9]), (7, 4, 2, [2, 2, 2, 1]),
+     (1000, 97, 10, [20] * 3 + [10] * 94), (3, 5, 1, [1, 1, 1])],
+)  # fmt: skip
+def test_no_object_goes_without_samples(views, instances, each, shown):
+    wanted = request(views)
+    used = used_instances(wanted, instances)
+    assert samples_per_instance(wanted, instances) == each
+    found = [0] * used
+    for shard in plan_shards(wanted, entries(used), instances):
+        for piece in shard.pieces:
+            found[piece.index] += piece.views
+    assert found == shown
 
 
 def test_whole_instances_share_a_shard_where_they_fit():

@@ -75,6 +75,22 @@ def wait_for(what: Callable[[], bool], seconds: float = 60.0) -> None:
         time.sleep(0.2)
 
 
+def test_colours_are_shown_of_data_that_only_hold_them(tmp_path: Path):
+    """As imported clouds do, and any that others wrote: the manifest need not say it."""
+    place = make(tmp_path, "laptop", color=True)
+    told = read_manifest(place / "manifest.json")
+    options = {name: value for name, value in told.options.items() if name != "color"}
+    write_bytes(place / "manifest.json", replace(told, options=options).to_json().encode())
+    viewer = Viewer(tmp_path, port=free_port())
+    try:
+        assert not viewer.paint_box.disabled
+        viewer.paint_box.value = "colour"
+        viewer.show(1)
+        assert (np.asarray(viewer.scene.cloud[0].colors) == viewer.row["color"]).all()
+    finally:
+        viewer.close()
+
+
 def test_splits_samples_and_the_object_of_each(viewer: Viewer):
     assert tuple(viewer.splits) == ("drawer/train", "laptop/train")
     thing = viewer.thing
