@@ -202,6 +202,8 @@ class Trainer:
             stage = stages[position.stage]
             if not position.started:
                 self._start(stage)
+            if position.epoch < stage.epochs:
+                self._recall(stage)
             optimizer = make_optimiser(self.method, stage)
             if moments is not None:
                 checkpoint.load_optimiser(optimizer, moments, self.folder.path)
@@ -229,7 +231,9 @@ class Trainer:
         """The method's start of a stage, by the first rank for all; saved, as it may take long."""
         began, earlier = time.monotonic(), 0.0
         if self.ranks.first:
-            earlier = self._first_start(stage)
+            data, noise = self.data, self.state.noise
+            begin = partial(self.method.start, stage.name, data.observation, data.labels, noise)
+            earlier = self._journalled(stage, begin)
         if self.ranks.count > 1:
             state = save(checkpoint.to_arrays(self.method)) if self.ranks.first else b""
             arrays = load(self.ranks.from_first(state, self.config.device))
@@ -239,8 +243,18 @@ class Trainer:
         if stage.epochs:
             self._save(None)
 
-    def _first_start(self, stage: Stage) -> float:
-        """That of the first rank, told and kept step by step; seconds of steps done before."""
+    def _recall(self, stage: Stage) -> None:
+        """What the method needs in the stage and no file of the run holds, on every rank."""
+        began, earlier = time.monotonic(), 0.0
+        again = partial(self.method.recall, stage.name, self.data.observation, self.state.noise)
+        if self.ranks.first:
+            earlier = self._journalled(stage, again)
+        else:
+            again()
+        self.state.position.spend(stage.name, time.monotonic() - began + earlier)
+
+    def _journalled(self, stage: Stage, begin: Callable[[], None]) -> float:
+        """Told and kept step by step; seconds of steps done before."""
 
         def tell(words: str, done: float, left: float) -> None:
             self.listener(
@@ -250,8 +264,7 @@ class Trainer:
         with self.folder.journal(stage.name, tell, self.config.workers) as journal:
             self.method.journal = journal
             try:
-                observation, labels = self.data.observation, self.data.labels
-                self.method.start(stage.name, observation, labels, self.state.noise)
+                begin()
             finally:
                 self.method.journal = Journal()
         return journal.earlier
