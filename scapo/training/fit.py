@@ -194,7 +194,7 @@ class Trainer:
 
     def _stages(self, moments: Arrays | None) -> None:
         position, stages = self.state.position, self.method.stages()
-        if moments is not None and position.scaler:
+        if position.scaler:
             self._load_scaler(position.scaler)
         if not stages:
             self._start(Stage(name="", epochs=0, lr=0.0))
