@@ -112,7 +112,8 @@ def fit(
     Raises:
         TrainingError: The loss or its gradient is not finite.
         StoreError: `resume` with another configuration or other data, or a run is there without
-            `resume`; or the folder cannot be written, what was saved before is whole.
+            `resume`; another training goes on in the folder; or it cannot be written, what was
+            saved before is whole.
         ValueError: Fewer samples in a batch than ranks or method need, or a precision that the
             method lacks.
     """
@@ -168,7 +169,8 @@ class Trainer:
         """All stages that are left."""
         finished, moments = False, None
         precision.require_networks(self.method, self.config.arithmetic)
-        with self._explained():
+        alone = self.folder.alone() if self.ranks.first else contextlib.nullcontext()
+        with self._explained(), alone:
             if self.folder.found(resume=resume):
                 finished, moments = self.folder.load(self.state, self.ranks.rank)
             elif self.ranks.first:
