@@ -43,6 +43,20 @@ def quit_at_interrupt(program: str) -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@contextmanager
+def interrupted_imports() -> Iterator[None]:
+    """Within, the import of a module in C++ that is interrupted raises the interrupt.
+
+    pybind11 makes an ImportError of it, as where matplotlib is imported for the first picture.
+    """
+    try:
+        yield
+    except ImportError as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):
+            raise KeyboardInterrupt from error
+        raise
+
+
 def exit_interrupted(line: str = "") -> NoReturn:
     """End the process as interrupted, after a line on stderr if there is one to be said.
 

@@ -263,8 +263,9 @@ class AbstractMethod(nn.Module, ABC):
         """Prepare a stage from the whole training split, such as a template from its medoid.
 
         Called once at the beginning of each stage, not again on resume: what it sets must be
-        in the state dict. A method without stages is called once, with stage "". One that takes
-        long tells `self.journal` how far it is, and has it keep what each of its steps made.
+        in the state dict, or found again by `recall`. A method without stages is called once,
+        with stage "". One that takes long tells `self.journal` how far it is, and has it keep
+        what each of its steps made.
 
         Args:
             stage: Its name.
@@ -272,6 +273,20 @@ class AbstractMethod(nn.Module, ABC):
             labels: As allowed by `supervision`.
             generator: On the device of the clouds.
         """
+
+    def recall(self, stage: str, observation: Observation, generator: torch.Generator) -> None:
+        """Have at hand what `losses` need beside the state dict; nothing by default.
+
+        Called before the epochs of each stage that are left, after `start` and on resume, in every
+        process of a training; what it finds depends on neither. `self.journal` is there as in
+        `start`, from the first process alone.
+
+        Args:
+            stage: Its name.
+            observation: All training clouds, as in `start`.
+            generator: For the journal; nothing is drawn from it.
+        """
+        del stage, observation, generator
 
     def rows(self, stage: Stage, total: int) -> Int[Tensor, " K"]:
         """Which of so many training clouds a stage that was started learns from, one or more.

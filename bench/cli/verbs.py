@@ -211,6 +211,8 @@ class Run(requests.GridRequest):
         failed = status.failed
         for one in failed:
             say(console, f"failed: {one.chain}: {one.reason}")
+        if count := grid.set_aside(plan):
+            say(console, f"{count} scores of an earlier plan are in {grid.aside}, in no table")
         for path in grid.tables(plan):
             say(console, path)
         if failed:

@@ -215,6 +215,24 @@ def is_finished(record: Record, entry: str, output: Path) -> bool:
     )
 
 
+def made_of(plan: Plan, chain: Chain, out: Path) -> dict[str, Record]:
+    """Records of the steps of a chain that this plan keeps, by name.
+
+    Their outputs are there, but not read again; data that are not there are taken to be as they
+    were.
+    """
+    made: dict[str, Record] = {}
+    for step in chain.steps:
+        record = read_record(record_path(out, chain.name, step))
+        there = record.output != "" and (out / step.output).is_file()
+        if there and all(name in made for name in step.needs):
+            data = {split: digest for split in step.reads if (digest := plan.data[split])}
+            entry = entry_of(step, plan.configs[chain.label], made, data)
+            if record.entry == entry or len(data) < len(step.reads):
+                made[step.name] = record
+    return made
+
+
 def record_path(out: Path, chain: str, step: Step) -> Path:
     """Where the record of a step is; its log is beside it, STEP.txt."""
     return out / "jobs" / chain / f"{step.name}.json"
@@ -250,10 +268,10 @@ class Estimate:
         self.left: dict[tuple[str, str], Step] = {}
         self._spent: dict[tuple[str, str], list[tuple[float, float]]] = {}
         for chain in plan.chains:
+            made = made_of(plan, chain, out)
             for step in chain.steps:
-                record = read_record(record_path(out, chain.name, step))
-                if record.output and (out / step.output).is_file():
-                    self.over(chain, step, record.seconds)
+                if step.name in made:
+                    self.over(chain, step, made[step.name].seconds)
                 else:
                     self.left[chain.name, step.name] = step
 

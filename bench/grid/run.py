@@ -12,15 +12,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from bench.grid.command import run_command
-from bench.grid.execute import Ended, Estimate, Machines, execute
+from bench.grid.execute import (
+    Ended,
+    Estimate,
+    Machines,
+    execute,
+    made_of,
+    read_record,
+    record_path,
+)
 from bench.grid.plan import PLAN, Chain, Plan, chosen, freeze, make_plan
 from bench.grid.presets import PRESETS, Preset, PresetName
 from bench.requests import GridRequest
-from scapo.store import StoreError
+from bench.scoring.score_files import SUFFIX
+from bench.tables.results import TABLE_SPLIT, UNSEEN_SPLIT
+from scapo.store import StoreError, sha256_file
 
 LOCK = ".lock"
 RUNS = Path("results/runs")
 """Where runs go unless told otherwise, a folder for each preset."""
+SCORES, ASIDE = "scores", "scores-of-earlier-plans"
 DATA_SEED = 2
 """Of data made here, as the benchmark's."""
 MADE = ("clean", "complete", "sensor")
@@ -86,7 +97,7 @@ class Grid:
                              f"{request.gpus}")  # fmt: skip
         self.request, self.presets = request, presets
         self.out = request.out or RUNS / request.preset
-        self.data = request.data or self.out / "data"
+        self.data, self.aside = request.data or self.out / "data", self.out / ASIDE
         self.machines = Machines(engine=request.engine, workers=request.workers, gpus=request.gpus)
 
     def plan(self, say: Callable[[str], None]) -> tuple[Plan, list[Chain]]:
@@ -154,17 +165,49 @@ class Grid:
                 words = f"{self.out}: interrupted; the same command goes on from here"
                 raise KeyboardInterrupt(words) from stop
 
+    def set_aside(self, plan: Plan) -> int:
+        """Move scores that an earlier plan made into a folder that no table is made from.
+
+        Returns:
+            How many, other readings of the same predictions not counted.
+        """
+        stale = self._stale(plan)
+        for path in stale:
+            for one in path.parent.glob(f"{path.name.removesuffix(SUFFIX)}.*"):
+                aside = self.aside / one.relative_to(self.out / SCORES)
+                aside.parent.mkdir(parents=True, exist_ok=True)
+                one.replace(aside)
+        return len(stale)
+
+    def _stale(self, plan: Plan) -> set[Path]:
+        """Of the splits that tables show, scores whose record is not of this plan.
+
+        What has no record was put there on purpose.
+        """
+        shown = tuple(f"-{split}" for split in (_shown(plan), UNSEEN_SPLIT, "real"))
+        records = {path: read_record(path) for path in (self.out / "jobs").rglob("evaluate-*.json")
+                   if path.stem.endswith(shown)}  # fmt: skip
+        own, stale = set[Path](), set[Path]()
+        for chain in plan.chains:
+            made = made_of(plan, chain, self.out)
+            for step in (one for one in chain.steps if one.kind == "evaluate"):
+                own.add(self.out / step.output)
+                known = records.pop(record_path(self.out, chain.name, step), None)
+                if known is not None and step.name not in made:
+                    stale.add(self.out / step.output)
+        others = {record.output for record in records.values()}
+        there = set((self.out / SCORES).rglob(f"*{SUFFIX}"))
+        return stale & there | {path for path in there - own if sha256_file(path) in others}
+
     def tables(self, plan: Plan) -> list[Path]:
         """The tables of all scores that are there, and the page of them; none without scores.
 
         Raises:
             StepError: They could not be made.
         """
-        scores, tables = self.out / "scores", self.out / "tables"
-        if not any(scores.rglob("*.csv.gz")):
+        scores, tables = self.out / SCORES, self.out / "tables"
+        if not any(scores.rglob(f"*{SUFFIX}")):
             return []
-        splits = {split.split("/")[-1] for split in plan.data} - {"train", "test-ood"}
-        split = "test" if "test" in splits else min(splits)
         words = [
             "tables",
             "--scores",
@@ -172,11 +215,17 @@ class Grid:
             "--out",
             str(tables),
             "--split",
-            split,
+            _shown(plan),
             "--html",
         ]
         run_command("scapo-bench", words, self.out / "jobs" / "tables.txt")
         return [tables / "table1.md", tables / "index.html"]
+
+
+def _shown(plan: Plan) -> str:
+    """The split that tables show beside objects unlike the training's."""
+    splits = {split.split("/")[-1] for split in plan.data}
+    return min(splits - {"train", UNSEEN_SPLIT}, default=TABLE_SPLIT)
 
 
 def _generate(data: Path, split: str, sizes: Mapping[str, tuple[int, int]] | None) -> list[str]:

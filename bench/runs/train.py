@@ -17,6 +17,7 @@ from bench.run_files import TIMING
 from bench.runs.align import align
 from bench.runs.report import REPORT, write_report
 from scapo.categories import CATEGORIES
+from scapo.interrupt import interrupted_imports
 from scapo.method import AbstractMethod
 from scapo.store import Split, open_split
 from scapo.store.checkpoint import WEIGHTS
@@ -49,7 +50,7 @@ def train(
     """
     device = own_device(pick_device(request.device))
     try:
-        with joined(device) as ranks:
+        with interrupted_imports(), joined(device) as ranks:
             try:
                 _fit(request, device, say if ranks.first else None, listener)
                 if ranks.first:

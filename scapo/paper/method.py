@@ -19,7 +19,7 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from scapo.categories import Category, JointKind
@@ -156,9 +156,7 @@ class Scapo(AbstractMethod):
         """
         del labels
         config, number = self.config, observation.points.shape[0]
-        asked = evenly(number, config.told).to(generator.device)
-        if config.part_start == "run":
-            self._warm().ask(observation, asked, generator, self.journal)
+        asked = self._ask(observation, generator)
         if stage != ARTICULATE or config.template_start == "random":
             return
         chosen = torch.randperm(number, generator=generator, device=generator.device)[:2000]
@@ -186,6 +184,18 @@ class Scapo(AbstractMethod):
             skeleton = told.skeleton(order, config.search.spread)
             self.template.part.copy_(told.part[0, order])
             self._teach(skeleton, told.lying(order, seen), clouds, seen, generator)
+
+    def recall(self, stage: str, observation: Observation, generator: torch.Generator) -> None:
+        """What the run says of the clouds that take the place of stage 1's losses."""
+        if stage == CANONICALISE:
+            self._ask(observation, generator)
+
+    def _ask(self, observation: Observation, generator: torch.Generator) -> Int[Tensor, " K"]:
+        """Have the run's answers about some clouds, if there is a run; their rows."""
+        asked = evenly(observation.points.shape[0], self.config.told).to(generator.device)
+        if self.config.part_start == "run":
+            self._warm().ask(observation, asked, generator, self.journal)
+        return asked
 
     def _warm(self) -> WarmStart:
         """The run that tells where the networks begin."""

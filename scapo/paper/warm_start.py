@@ -221,11 +221,12 @@ def frame_errors(encoding: Encoding, told: Told) -> Float[Tensor, " B"]:
 
 
 class WarmStart:
-    """A trained method that is asked for each training cloud once, where it is first needed.
+    """A trained method that is asked for each training cloud once, before it is needed.
 
     Where a symmetry of the category exchanges two parts, the method cannot tell which is which
     (nor does the evaluation ask): each cloud then has two readings, and of these the one nearer to
-    what the encoder says is learned.
+    what the encoder says is learned. How the parts change places is told by all clouds that are
+    asked about at first, so that a training which continues reads them as before.
     """
 
     def __init__(self, method: AbstractMethod, mode: Mode = "quick") -> None:
@@ -263,6 +264,8 @@ class WarmStart:
             journal.tell("asked about clouds", number / len(lots), pace * (len(lots) - number))
             found = journal.once(f"told {number}", job, generator, {Told.__name__: Told})
             self._keep(lot, found)
+        if self.two_readings and self.exchange is None:
+            self.exchange = Exchange.of(self.of(observation, index))
 
     def _keep(self, index: Int[Tensor, " B"], told: Told) -> None:
         self.known |= {row: take(told, torch.tensor([i])) for i, row in enumerate(index.tolist())}
@@ -283,8 +286,6 @@ class WarmStart:
             pose: How they were moved before that; None: not at all.
         """
         told = self.of(observation, index)
-        if self.two_readings and self.exchange is None:
-            self.exchange = Exchange.of(told)
         moved = told if pose is None else told.turned(pose)
         return (
             moved

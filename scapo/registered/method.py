@@ -143,6 +143,8 @@ class TemplateRegistration(AbstractRegistered):
         Without it views are placed so much worse that the same objects are found to deviate by one
         draw and not by the next.
         """
+        if len(cloud) >= 2 * self._taught():
+            self._frames = None  # of other clouds: those of the round before (`taught_rows`)
         asked = self.config.discovery.leans and self.config.teach == "all"
         alike = are_alike(self.template.kinds) and "revolute" in self.template.kinds
         if asked and alike and self._has_learned() and not self.template.deviates():

@@ -112,7 +112,8 @@ def fit(
     Raises:
         TrainingError: The loss or its gradient is not finite.
         StoreError: `resume` with another configuration or other data, or a run is there without
-            `resume`; or the folder cannot be written, what was saved before is whole.
+            `resume`; another training goes on in the folder; or it cannot be written, what was
+            saved before is whole.
         ValueError: Fewer samples in a batch than ranks or method need, or a precision that the
             method lacks.
     """
@@ -168,7 +169,8 @@ class Trainer:
         """All stages that are left."""
         finished, moments = False, None
         precision.require_networks(self.method, self.config.arithmetic)
-        with self._explained():
+        alone = self.folder.alone() if self.ranks.first else contextlib.nullcontext()
+        with self._explained(), alone:
             if self.folder.found(resume=resume):
                 finished, moments = self.folder.load(self.state, self.ranks.rank)
             elif self.ranks.first:
@@ -194,7 +196,7 @@ class Trainer:
 
     def _stages(self, moments: Arrays | None) -> None:
         position, stages = self.state.position, self.method.stages()
-        if moments is not None and position.scaler:
+        if position.scaler:
             self._load_scaler(position.scaler)
         if not stages:
             self._start(Stage(name="", epochs=0, lr=0.0))
@@ -202,6 +204,8 @@ class Trainer:
             stage = stages[position.stage]
             if not position.started:
                 self._start(stage)
+            if position.epoch < stage.epochs:
+                self._recall(stage)
             optimizer = make_optimiser(self.method, stage)
             if moments is not None:
                 checkpoint.load_optimiser(optimizer, moments, self.folder.path)
@@ -229,7 +233,9 @@ class Trainer:
         """The method's start of a stage, by the first rank for all; saved, as it may take long."""
         began, earlier = time.monotonic(), 0.0
         if self.ranks.first:
-            earlier = self._first_start(stage)
+            data, noise = self.data, self.state.noise
+            begin = partial(self.method.start, stage.name, data.observation, data.labels, noise)
+            earlier = self._journalled(stage, begin)
         if self.ranks.count > 1:
             state = save(checkpoint.to_arrays(self.method)) if self.ranks.first else b""
             arrays = load(self.ranks.from_first(state, self.config.device))
@@ -239,8 +245,18 @@ class Trainer:
         if stage.epochs:
             self._save(None)
 
-    def _first_start(self, stage: Stage) -> float:
-        """That of the first rank, told and kept step by step; seconds of steps done before."""
+    def _recall(self, stage: Stage) -> None:
+        """What the method needs in the stage and no file of the run holds, on every rank."""
+        began, earlier = time.monotonic(), 0.0
+        again = partial(self.method.recall, stage.name, self.data.observation, self.state.noise)
+        if self.ranks.first:
+            earlier = self._journalled(stage, again)
+        else:
+            again()
+        self.state.position.spend(stage.name, time.monotonic() - began + earlier)
+
+    def _journalled(self, stage: Stage, begin: Callable[[], None]) -> float:
+        """Told and kept step by step; seconds of steps done before."""
 
         def tell(words: str, done: float, left: float) -> None:
             self.listener(
@@ -250,8 +266,7 @@ class Trainer:
         with self.folder.journal(stage.name, tell, self.config.workers) as journal:
             self.method.journal = journal
             try:
-                observation, labels = self.data.observation, self.data.labels
-                self.method.start(stage.name, observation, labels, self.state.noise)
+                begin()
             finally:
                 self.method.journal = Journal()
         return journal.earlier

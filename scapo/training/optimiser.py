@@ -109,9 +109,8 @@ def make_optimiser(method: AbstractMethod, stage: Stage) -> torch.optim.Optimize
     method.requires_grad_(False)
     kind = stage.optimiser
     if isinstance(kind, Sgd):
-        return torch.optim.SGD(
-            groups, lr=stage.lr, momentum=kind.momentum, nesterov=kind.nesterov, fused=True
-        )
+        # Not fused: where the first gradient overflows, torch 2.13 leaves its momentum unset.
+        return torch.optim.SGD(groups, lr=stage.lr, momentum=kind.momentum, nesterov=kind.nesterov)
     return torch.optim.Adam(groups, lr=stage.lr, betas=kind.betas, fused=True)
 
 

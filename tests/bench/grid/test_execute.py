@@ -60,6 +60,9 @@ def test_a_training_of_another_plan_is_begun_anew(folder: Path):
     plan = plan_of(folder)
     config = {**plan.configs["scapo"], "config": {"epochs": 7}}
     object.__setattr__(plan, "configs", {**plan.configs, "scapo": config})
+    of_scapo = [one for one in plan.chains if one.label == "scapo"]
+    left = Estimate(plan, folder / "out").left
+    assert {(one.name, step.name) for one in of_scapo for step in one.steps} <= left.keys()
     assert run(plan, folder, "scapo")[0].state == "made"
     assert not (run_folder / "of the first").exists()
 

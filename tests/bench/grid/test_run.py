@@ -7,6 +7,7 @@ import fcntl
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from bench.requests import GridRequest
 from scapo.store import StoreError
 from sim_assets import __main__ as data_program
 from tests.helpers.grids import CALLS, calls, make_splits, preset
+from tests.helpers.made import sample_arrays, write_split
 
 
 @pytest.fixture
@@ -60,6 +62,38 @@ def test_the_quick_twin_of_smoke(folder: Path, capsys):
     assert calls(folder)[-1] == "tables tables"
     assert len(json.loads((folder / "out" / "plan.json").read_text())["chains"]) == 3
     assert "clean/oven/scapo/seed1: 6 kept" in said(words(folder, only=("scapo/seed1",)))
+
+
+def test_scores_of_an_earlier_plan_are_in_no_table(folder: Path, monkeypatch):
+    """Another seed, and other steps for a chain that is not asked for; scores put there stay."""
+    make_splits(folder)
+    monkeypatch.setattr(run, "Grid", partial(Grid, presets={"smoke": preset(1, 2)}))
+    assert "earlier plan" not in said(words(folder))
+    scores = folder / "out" / "scores" / "clean"
+    reading = scores / "oven-scapo-seed2-fast-test.one-order.csv.gz"
+    for path in (reading, scores / "restored.csv.gz"):
+        path.write_text("")
+    there = {path.name for path in scores.iterdir()}
+    fewer = replace(preset(1), calibration=3)
+    monkeypatch.setattr(run, "Grid", partial(Grid, presets={"smoke": fewer}))
+    text = said(words(folder, replan=True, only=("icp",)))
+    assert "2 scores of an earlier plan are in" in text
+    left = {path.name for path in scores.iterdir()}
+    assert left == {"oven-icp-seed1-fast-test.csv.gz", "restored.csv.gz"}
+    aside = folder / "out" / "scores-of-earlier-plans" / "clean"
+    assert {path.name for path in aside.iterdir()} == there - left
+    said(words(folder, only=("scapo",)))
+    assert (scores / "oven-scapo-seed1-fast-test.csv.gz").is_file()
+    assert (aside / reading.name).is_file()
+
+
+def test_objects_unlike_the_trainings_alone_have_tables(folder: Path, monkeypatch):
+    make_splits(folder)
+    write_split(folder / "data" / "clean", "oven", "test-ood", sample_arrays("oven", 4, 64))
+    small = replace(preset(1), sizes={"train": (6, 2), "test-ood": (4, 2)})
+    monkeypatch.setattr(run, "Grid", partial(Grid, presets={"smoke": small}))
+    said(words(folder, only=("icp",), splits=("test-ood",)))
+    assert calls(folder)[-1] == "tables tables"
 
 
 def test_plan_only_writes_the_plan_alone(folder: Path):

@@ -48,6 +48,20 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+def test_an_interrupt_amid_the_import_of_the_first_picture_is_one(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def struck(*_: object) -> None:
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr("scapo.pictures.render", struck)
+    with pytest.raises(SystemExit) as stop:
+        command("train", "scapo", "--category", "laptop", "--data", data, "--out", tmp_path,
+                "--device", "cpu", *FLAGS["scapo"])  # fmt: skip
+    assert stop.value.code == 130
+    assert "interrupted; saved after step 0" in capsys.readouterr().err
+
+
 def test_the_run_is_that_of_the_flags(run: Path) -> None:
     config = read_header(run / "checkpoint.safetensors")["config"]
     assert config["preset"] == "cpu"

@@ -25,13 +25,17 @@ from scapo.paper.method import ARTICULATE, CANONICALISE, Scapo
 from scapo.paper.skinning import cross_maps, deform, part_maps
 from scapo.paper.warm_start import Exchange, Told, WarmStart, imitation
 from scapo.registered.method import load_run
+from scapo.store.checkpoint import WEIGHTS
+from scapo.store.samples import TrainingData
 from scapo.store.schema import StoreError
+from scapo.training import fit
 from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation, Prediction
 from tests.helpers.placed import Told as Oracle
 from tests.helpers.placed import placed_run
 from tests.helpers.strategies import generator
 from tests.helpers.tiny import TINY, tiny
+from tests.helpers.two_ranks import CONFIG, StoppedError, stop_after
 
 KINDS = ("revolute",)
 LEGS: tuple[JointKind, ...] = ("revolute", "revolute")
@@ -344,6 +348,22 @@ def test_a_start_that_cannot_be_is_refused(run: Path, tmp_path: Path) -> None:
         warm(tmp_path).start(CANONICALISE, observation, Labels(), generator(1))
     with pytest.raises(StoreError, match="expected a run of registered on laptop"):
         load_run(run, CATEGORIES["laptop"])
+
+
+def test_a_stopped_training_reads_laptops_as_before(tmp_path: Path) -> None:
+    """Which reading of a cloud is learned does not depend on the batch that came first."""
+    start = placed_run(tmp_path / "run", category="laptop")
+    config = replace(WARM, start=str(start), told=12, batch=4)
+    data = TrainingData(observation=oracle(12)[1], labels=Labels(), digest="d")
+
+    def train(folder: Path, listener: fit.Listener = fit.silent, *, resume: bool = False) -> bytes:
+        model = Scapo(config, CATEGORIES["laptop"], generator(0))
+        fit.fit(model, data, folder, CONFIG, resume=resume, listener=listener)
+        return (folder / "metrics.jsonl").read_bytes() + (folder / WEIGHTS).read_bytes()
+
+    with pytest.raises(StoppedError):  # in the second epoch of the first stage
+        train(tmp_path / "stopped", stop_after(6))
+    assert train(tmp_path / "stopped", resume=True) == train(tmp_path / "whole")
 
 
 def test_what_the_run_was_told_the_warm_start_says_too(tmp_path: Path) -> None:

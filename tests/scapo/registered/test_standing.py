@@ -17,6 +17,7 @@ from scapo.records import take
 from scapo.registered import method as room
 from scapo.registered.config import RegisteredConfig
 from scapo.registered.initialisation import FRAME_EVERY
+from scapo.registered.learning import taught_rows
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.objects import rows_by_object
 from scapo.registered.orientation import OrientationScorer
@@ -247,6 +248,17 @@ def test_objects_are_asked_where_they_are_known_and_look_one_way(
     assert_close(best[says], truth[says], atol=1e-5, rtol=0)
     again, _ = method._trusted(found, cloud, labels, generator(1))  # frames are asked for once
     assert torch.equal(again.gap, learned.gap)
+
+
+@pytest.mark.parametrize(("count", "kept"), [(9, True), (10, False)])
+def test_frames_are_asked_for_again_where_a_round_has_other_clouds(count: int, kept: bool) -> None:
+    config = RegisteredConfig(stand="objects", of_objects=5, supervision=("instance",))
+    method = TemplateRegistration(config, CATEGORIES["oven"], generator(0))
+    method._frames = []
+    method._revise(torch.zeros(count, 5, 3), generator(1))
+    rows = [taught_rows(count, 5, stage) for stage in ("votes", "round-2")]
+    assert torch.equal(*rows) == kept
+    assert (method._frames is not None) == kept
 
 
 def test_a_network_that_has_learned_is_asked_about_the_views_of_objects(

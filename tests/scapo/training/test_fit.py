@@ -150,6 +150,21 @@ def test_a_run_in_the_way_is_refused(whole: Path) -> None:
         run(whole)
 
 
+def test_two_trainings_at_once_do_not_mix_in_a_folder(whole: Path, tmp_path: Path) -> None:
+    """The other is refused before anything is saved; afterwards the folder is free."""
+
+    def listener(progress: fit.Progress) -> None:
+        del progress
+        with pytest.raises(StoreError, match="no training goes on, found another at work there"):
+            run(tmp_path, config=replace(CONFIG, seed=2))
+        raise StoppedError
+
+    with pytest.raises(StoppedError):
+        fit.fit(tiny(), tiny_data(), tmp_path, CONFIG, listener=listener)
+    run(tmp_path, resume=True)
+    same(whole, tmp_path)
+
+
 def test_another_configuration_does_not_resume(whole: Path) -> None:
     with pytest.raises(
         StoreError, match=r'config: expected \{"gamma":0\.5\} to resume, found \{"gamma":0\.01\};'

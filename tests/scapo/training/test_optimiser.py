@@ -13,10 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from scapo.method import Adam, HalfCosine, ParameterGroup, Sgd, Stage, Step, StepDecay
-from scapo.store.checkpoint import TRAINING
+from scapo.store.checkpoint import TRAINING, WEIGHTS
 from scapo.store.files import read
 from scapo.training import fit
 from scapo.training.optimiser import learning_rate, make_optimiser, schedule
+from scapo.training.precision import Arithmetic
 from scapo.types import Labels, Observation
 from tests.helpers.tiny import tiny_data
 from tests.helpers.two_ranks import CONFIG, Line, StoppedError, stop_after
@@ -80,6 +81,14 @@ class Slid(Line):
         )
 
 
+class Steep(Slid):
+    """Its gradient overflows float16 at the first scales."""
+
+    def losses(self, observation: Observation, labels: Labels, step: Step) -> dict[str, Tensor]:
+        terms = super().losses(observation, labels, step)
+        return {name: 1000 * value for name, value in terms.items()}
+
+
 class InTurn(Line):
     """One parameter is trained after the other."""
 
@@ -124,3 +133,32 @@ def test_gradient_descent_continues_bit_for_bit(kind: type[Slid], tmp_path: Path
         assert (whole[f"weights/{name}"] == value.numpy()).all()
     curves = [(tmp_path / name / "metrics.jsonl").read_bytes() for name in ("whole", "cut")]
     assert curves[0] == curves[1]
+
+
+def test_an_overflow_leaves_no_momentum() -> None:
+    """Nor what happens to lie in the memory of one."""
+    method = Slid()
+    optimizer = make_optimiser(method, method.stages()[0])
+    schedule(method.stages()[0], optimizer, 0.0)
+    scaler = torch.amp.GradScaler("cpu")
+    before = method.map.weight.detach().clone()
+    for value in (torch.inf, 1.0):
+        scaler.scale(torch.ones(()))
+        for parameter in method.parameters():
+            parameter.grad = torch.full_like(parameter, value) * scaler.get_scale()
+        scaler.unscale_(optimizer)
+        scaler.step(optimizer)
+        scaler.update()
+        momentum = optimizer.state[method.map.weight].get("momentum_buffer")
+        assert (momentum is None) == (value == torch.inf)
+    torch.testing.assert_close(method.map.weight.detach(), before - 0.03 * 1.9)
+
+
+def test_gradient_descent_in_float16_continues_bit_for_bit(tmp_path: Path) -> None:
+    config = replace(CONFIG, arithmetic=Arithmetic(precision="float16"))
+    fit.fit(Steep(), tiny_data(), tmp_path / "whole", config)
+    with pytest.raises(StoppedError):
+        fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, listener=stop_after(5))
+    fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, resume=True)
+    for name in (WEIGHTS, "metrics.jsonl"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -107,11 +107,12 @@ def test_overflowing_steps_are_left_out_until_the_scale_fits(tmp_path: Path) -> 
     assert not (tmp_path / "bad-batch.safetensors").exists()
 
 
-def test_a_run_in_float16_continues_bit_for_bit(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stop", [5, 7])  # steps of six in a stage
+def test_a_run_in_float16_continues_bit_for_bit(tmp_path: Path, stop: int) -> None:
     config = replace(CONFIG, arithmetic=Arithmetic(precision="float16"))
     fit.fit(Steep(), tiny_data(), tmp_path / "whole", config)
     with pytest.raises(StoppedError):
-        fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, listener=stop_after(5))
+        fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, listener=stop_after(stop))
     fit.fit(Steep(), tiny_data(), tmp_path / "cut", config, resume=True)
     for name in (WEIGHTS, "metrics.jsonl"):
         assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
