@@ -63,10 +63,9 @@ SAME, CLEARER, MIRRORED = 0.8, 0.75, 0.03
 """Share of the points that a mirror plane has to leave where they are, and how unlike halves may be
 that it cuts, over those that are there and by themselves: of suitcases 0.85, 0.6 and 0.018, of
 scissors 0.72 or 0.9. Boxes of safes may be cut through the hinge to 0.8, 0.6 and 0.042."""
-ASIDE, REACH, PLACES_ASIDE, BORDER = 0.15, 0.15, 31, 0.03
-"""Normalised lengths: how far beside the hinge planes lie that are tried, and along them hinges, of
-so many places; from the plane to where a point is surely of one half."""
-TIGHT = 0.03  # Shift that counts as large when a hinge is chosen
+ASIDE, PLACES_ASIDE, BORDER = 0.15, 31, 0.03
+"""Normalised lengths: how far beside the hinge planes lie that are tried, of so many places; from
+the plane to where a point is surely of one half."""
 
 
 def may_have_halves(template: ArticulatedTemplate) -> bool:
@@ -128,8 +127,9 @@ def cut_by_mirror(template: ArticulatedTemplate, placement: Placement) -> Placem
         placement: Of the views that it was fitted to.
 
     Returns:
-        The same motions as turns about the new hinge, which is where on the plane they leave the
-        least shift, with the shifts that are left.
+        The same motions as turns about the new hinge, which is where the halves touch, with the
+        shifts that are left: those that were found are small about the old one, by which they were
+        priced.
     """
     if not may_have_halves(template):
         return placement
@@ -151,30 +151,7 @@ def cut_by_mirror(template: ArticulatedTemplate, placement: Placement) -> Placem
     side = ((seen @ normal - place) / BORDER).clamp(-1, 1) * SURENESS / 2
     template.logit.copy_(torch.stack([-side, side], -1))
     logger.info("two halves cut by their mirror plane: %.3f beside the hinge", abs(place))
-    return _hinge_on(template, placement, normal, place)
-
-
-def _hinge_on(
-    template: ArticulatedTemplate, placement: Placement, normal: Tensor, place: float
-) -> Placement:
-    """Put the hinge on the plane, where motions leave the least shift, in place."""
-    axis = template.directions()[0]
-    frame = torch.cat([across_axis(axis), axis[None]])
-    along = torch.linalg.cross(frame[2], normal @ frame)
-    turn, scale = template.turns(placement)[:, 0], placement.log_scale.exp()
-    lever = torch.eye(3).to(turn) - turn
-
-    def left(step: Tensor) -> Tensor:
-        moved = scale * (place * normal @ frame + step * along)
-        shift = placement.shift[:, 0] - (lever @ moved[..., None])[..., 0]
-        return shift - (shift @ axis)[:, None] * axis
-
-    steps = torch.linspace(-REACH, REACH, PLACES_ASIDE).to(axis)
-    costs = [(left(step).norm(dim=-1) / TIGHT).square().log1p().mean() for step in steps]
-    step = steps[int(torch.stack(costs).argmin())]
-    shift = left(step)[:, None]
-    template.pivot[0] += place * normal @ frame + step * along
-    return replace(placement, shift=shift)
+    return settle_hinges(template, placement, touching=True)
 
 
 def in_halves(

@@ -213,6 +213,13 @@ def shells(
     return made, half
 
 
+def as_its_part_lies(made: ArticulatedTemplate, placement: Placement) -> Tensor:
+    """All points (B, M, 3) as the part that moves carries its own."""
+    poses = made.part_poses(placement)
+    return made.points.detach() @ poses.rotation[:, 1].mT + poses.translation[:, 1:]
+
+
+@torch.no_grad()
 def test_shells_are_cut_where_they_mirror_each_other_and_motions_stay():
     angle = torch.linspace(-0.9, 0.6, 8)[:, None]
     for reach, strip, swapped, told in (
@@ -231,10 +238,11 @@ def test_shells_are_cut_where_they_mirror_each_other_and_motions_stay():
         lever = torch.eye(3) - rotvec_to_rotmat(made.directions().detach() * angle)
         still = (lever @ (hinge - made.pivot.detach()[0])[:, None])[:, None, :, 0]
         placement = replace(placement, shift=still)  # turned about the true hinge
-        poses = made.part_poses(placement)
+        lay = as_its_part_lies(made, placement)
         placement = cut_by_mirror(made, placement)
         after = (made.logit.argmax(-1) == truth).float().mean()
-        assert torch.allclose(made.part_poses(placement).translation, poses.translation, atol=1e-6)
+        moves = made.logit.argmax(-1) == 1
+        assert (as_its_part_lies(made, placement) - lay)[:, moves].norm(dim=-1).max() < 1e-3
         if reach:
             assert before < 0.95
             assert after > 0.98
