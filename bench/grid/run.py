@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,9 +24,9 @@ from bench.grid.presets import PRESETS, Preset, PresetName
 from bench.requests import GridRequest
 from bench.scoring.score_files import SUFFIX
 from bench.tables.results import TABLE_SPLIT, UNSEEN_SPLIT
-from scapo.store import StoreError, sha256_file
+from scapo.store import sha256_file
+from scapo.store.folders import alone
 
-LOCK = ".lock"
 RUNS = Path("results/runs")
 """Where runs go unless told otherwise, a folder for each preset."""
 SCORES, ASIDE = "scores", "scores-of-earlier-plans"
@@ -156,7 +154,7 @@ class Grid:
             KeyboardInterrupt: With what to do next.
         """
         done = execute(plan, status.chains, self.out, self.data, self.machines, status.hear)
-        with _alone(self.out):
+        with alone(self.out, "run"):
             try:
                 for name, ended in done:
                     status.end(name, ended)
@@ -237,20 +235,3 @@ def _generate(data: Path, split: str, sizes: Mapping[str, tuple[int, int]] | Non
     words = ["generate", category, "--out", str(data / part), "--split", kind, "--count",
              str(count), "--instances", str(instances), "--seed", str(DATA_SEED)]  # fmt: skip
     return [*words, "--protocol", "isolated"] if part == "isolated" else words
-
-
-@contextmanager
-def _alone(out: Path) -> Iterator[None]:
-    """Keep other runs out of a folder; a run that was killed keeps nobody out.
-
-    Raises:
-        StoreError: Another goes on there.
-    """
-    with (out / LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise StoreError(
-                f"{out}: expected a folder in which no run goes on, found another at work there"
-            ) from error
-        yield

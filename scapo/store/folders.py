@@ -7,6 +7,7 @@ file was added, changed or taken away since, is somebody's work: it is refused a
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import tempfile
@@ -18,10 +19,39 @@ from typing import cast
 from scapo.store.files import canonical_json, sha256_file
 from scapo.store.json_records import MAX_JSON, parse_json
 from scapo.store.regular import read_regular
+from scapo.store.schema import StoreError
 
 MADE = ".made.json"
 FORMAT = "scapo-folder/1"
 OURS = "what this program wrote"
+
+
+@contextmanager
+def alone(folder: Path, work: str) -> Iterator[None]:
+    """Keep others out of a folder, which is made; who was killed keeps nobody out.
+
+    Args:
+        folder: On a file system without locks nobody is kept out.
+        work: What goes on there, for the error.
+
+    Raises:
+        StoreError: It goes on there already.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise StoreError(
+                f"{folder}: expected a folder in which no {work} goes on, found another at work "
+                "there"
+            ) from error
+        except OSError:  # no locks here
+            pass
+        yield
+    finally:
+        os.close(held)
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from torch.optim import Optimizer
 from scapo.method import AbstractMethod, Journal, Stage, Step
 from scapo.store import checkpoint
 from scapo.store.files import Arrays
+from scapo.store.folders import alone
 from scapo.store.samples import TrainingData
 from scapo.store.schema import StoreError
 from scapo.training import precision
@@ -169,8 +170,9 @@ class Trainer:
         """All stages that are left."""
         finished, moments = False, None
         precision.require_networks(self.method, self.config.arithmetic)
-        alone = self.folder.alone() if self.ranks.first else contextlib.nullcontext()
-        with self._explained(), alone:
+        path = self.folder.path
+        held = alone(path, "training") if self.ranks.first else contextlib.nullcontext()
+        with self._explained(), held:
             if self.folder.found(resume=resume):
                 finished, moments = self.folder.load(self.state, self.ranks.rank)
             elif self.ranks.first:
@@ -178,8 +180,8 @@ class Trainer:
             if finished:
                 return
             self.ranks.wait()  # no rank looks for a run that another has begun
-            path = self.folder.path if self.ranks.first else None
-            self.log = Log(path, self.state.position.step, self.ranks.total)
+            logged = path if self.ranks.first else None
+            self.log = Log(logged, self.state.position.step, self.ranks.total)
             with contextlib.closing(self.log):
                 self._stages(moments)
 

@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -137,30 +134,6 @@ class RunFolder:
         return checkpoint.checkpoint_header(
             self.method.name, self.method.config, self.method.category.name, extra
         )
-
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Keep other trainings out; one that was killed keeps nobody out.
-
-        Raises:
-            StoreError: Another goes on there.
-        """
-        self.path.mkdir(parents=True, exist_ok=True)
-        folder = os.open(self.path, os.O_RDONLY)
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(folder)
-            raise StoreError(
-                f"{self.path}: expected a folder in which no training goes on, found another at "
-                "work there"
-            ) from error
-        except OSError:  # a file system without locks
-            pass
-        try:
-            yield
-        finally:
-            os.close(folder)
 
     def begin(self) -> None:
         """Write config.json."""

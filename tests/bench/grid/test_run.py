@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import io
 import json
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from bench.grid import command, execute, run
 from bench.grid.run import Grid
 from bench.requests import GridRequest
 from scapo.store import StoreError
+from scapo.store.folders import alone
 from sim_assets import __main__ as data_program
 from tests.helpers.grids import CALLS, calls, make_splits, preset
 from tests.helpers.made import sample_arrays, write_split
@@ -143,11 +143,11 @@ def test_a_run_has_a_folder_of_its_own_unless_told(folder: Path, monkeypatch):
 
 def test_one_run_at_a_time_in_a_folder(folder: Path):
     make_splits(folder)
-    (folder / "out").mkdir()
-    with (folder / "out" / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(StoreError, match="found another at work there"):
-            said(words(folder))
+    with (
+        alone(folder / "out", "run"),
+        pytest.raises(StoreError, match="no run goes on, found another at work there"),
+    ):
+        said(words(folder))
     assert "5 made" in said(words(folder, only=("icp",)))
 
 
