@@ -131,7 +131,10 @@ def exchanged(rung: Rung, mine: Pieces, true: Pieces, frames: Frames) -> Pieces:
         pieces = replace(mine, pivot=_move(carry, true.pivot), axis=_turn(carry, true.axis))
     if rung == "state":
         pieces = replace(mine, state=true.state)
-    return replace(pieces, pose=composed(pieces, frames.revolute))
+    made = composed(pieces, frames.revolute)
+    known = np.isfinite(made).all((2, 3), keepdims=True)
+    # Without a joint or state nothing can be put together: an error must not fall out of the mean.
+    return replace(pieces, pose=np.where(known, made, mine.pose))
 
 
 def composed(pieces: Pieces, revolute: np.ndarray) -> Float[np.ndarray, "B P 4 4"]:

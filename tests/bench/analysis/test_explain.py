@@ -151,6 +151,21 @@ def test_missing_slots_are_in_no_rung_that_would_need_them(split, tmp_path):
     assert all(np.isnan(value) if single else value < 1e-4 for value in states)
 
 
+@pytest.mark.parametrize("missing", ["joint_state", "joint_axis"])
+def test_a_child_that_cannot_be_put_together_stays_as_predicted(split, tmp_path, missing):
+    """Else its error would fall out of the mean, as though the true joint cured it."""
+    arrays = made.truth_as_prediction(split)
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.0]).as_matrix()
+    arrays["camera_T_part"][:, 1:, :3, :3] = arrays["camera_T_part"][:, 1:, :3, :3] @ turn
+    del arrays[missing]
+    found = ladder(split, arrays, tmp_path)
+    expected = found["predicted", "part_rotation", "deg"]
+    assert expected > 20
+    rungs = ["recomposed", "joint"] if missing == "joint_state" else ["recomposed", "state"]
+    for rung in rungs:
+        assert found[rung, "part_rotation", "deg"] == pytest.approx(expected)
+
+
 def test_factors_say_where_the_camera_is(tmp_path):
     """Cameras placed by hand about an object at the origin."""
     arrays = made.sample_arrays("laptop", 4, 30)
