@@ -115,7 +115,8 @@ def _pixels(path: Path, what: str) -> np.ndarray:
                 size = f"{image.width} x {image.height}"
                 raise InputError(f"{path}: expected at most {MOST_PIXELS:,} pixels, found {size}")
             warnings.simplefilter("ignore")  # of tags that nobody asks about
-            return np.asarray(image)
+            # Of a palette the colours are meant: its numbers may stand for them in any order.
+            return np.asarray(image.convert("RGB") if image.mode == "P" else image)
     except InputError:
         raise
     except Exception as error:  # whatever the reader meets in a broken file

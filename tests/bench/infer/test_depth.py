@@ -50,6 +50,15 @@ def test_points_project_to_their_pixels_at_their_depth(image):
     np.testing.assert_allclose(twice.points, 2 * cloud.points, rtol=1e-5)
 
 
+def test_a_mask_with_a_palette_is_read_by_its_colours(image):
+    """Programs number colours as they like, also black as 1 and white as 0."""
+    _, mask, _, shown = image
+    picture = Image.fromarray((~shown).astype(np.uint8), "L").convert("P")
+    picture.putpalette([255, 255, 255, 0, 0, 0])
+    picture.save(mask)
+    np.testing.assert_array_equal(read_mask(mask, (HEIGHT, WIDTH)), shown)
+
+
 @pytest.mark.parametrize("bands", ["L", "LA", "RGB", "RGBA"])
 def test_a_mask_is_read_from_colours_and_greys_but_not_from_transparency(bands, image):
     path, mask, _, shown = image
