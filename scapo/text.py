@@ -143,6 +143,14 @@ def as_markdown(text: str) -> str:
 
     >>> as_markdown("a|b <img src=x> [c](d) R&D")
     'a\\|b &lt;img src=x&gt; [c]\\(d) R&amp;D'
+    >>> print(as_markdown("a\\|b"))
+    a\\\|b
     """
-    line = one_line(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    line = (
+        one_line(text)
+        .replace("\\", "\\\\")
+        .replace("&", "&amp;")
+        .replace("<", "&lt;")
+        .replace(">", "&gt;")
+    )
     return line.replace("|", "\\|").replace("](", "]\\(")
