@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import zipfile
 from collections.abc import Sequence
@@ -191,4 +190,5 @@ def _array(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
     check_count(str(path), shape[0] if shape else 0)
     if int(np.prod(shape, dtype=object)) > 3 * max(shape[0] if shape else 1, 1):
         raise InputError(f"{path}: {name}: expected three numbers a row, found shape {shape}")
-    return np.lib.format.read_array(io.BytesIO(archive.read(f"{name}.npy")), allow_pickle=False)
+    with archive.open(f"{name}.npy") as file:  # no further than the array: what follows may be much
+        return np.lib.format.read_array(file, allow_pickle=False)

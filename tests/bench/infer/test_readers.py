@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -139,6 +140,21 @@ def test_what_is_broken_is_named(name, tmp_path):
     with pytest.raises(InputError, match=message) as refused:
         read_input(path, ReadOptions())
     assert str(path) in str(refused.value)
+
+
+def test_of_an_entry_no_more_is_unpacked_than_its_array(tmp_path):
+    """A few kilobytes of an upload may be packed from any amount."""
+    buffer = io.BytesIO()
+    np.save(buffer, POINTS)
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", buffer.getvalue() + bytes(100 << 20))
+    tracemalloc.start()
+    cloud = read_input(path, ReadOptions())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert peak < 10 << 20
 
 
 def test_numbers_too_large_for_their_type_are_left_out_without_a_word_on_stderr(tmp_path):
