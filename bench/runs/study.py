@@ -105,7 +105,8 @@ class _Study:
         scored = out / "predictions" / f"{name}-{split}.safetensors"
         trained = out / "predictions" / f"{name}-train.safetensors"
         self._predict(run, scored, mode, None)
-        if calibrated and trained != scored:
+        calibrated = calibrated and trained != scored  # nothing is calibrated on what is scored
+        if calibrated:
             self._predict(run, trained, mode, self.request.calibration)
         inputs = (scored, trained) if calibrated else (scored,)
         frames = trained if calibrated else None

@@ -65,6 +65,20 @@ def test_a_study_is_made_once_and_told_on_one_page(tmp_path, capsys) -> None:
     assert (out / PAGE).read_text() == page
 
 
+def test_the_training_split_is_scored_without_a_calibration(tmp_path, monkeypatch) -> None:
+    """Which would be one on the clouds that are scored, and is refused."""
+    made.make_data(tmp_path / "data", "laptop", count=2, train=4, points=96)
+    run, out = write_run(tmp_path / "run", 1), tmp_path / "study"
+    for name in ("explain", "draw_pictures"):
+        monkeypatch.setattr(study, name, lambda _: [])
+    program.main(["study", run, "--data", str(tmp_path / "data"), "--out", str(out), "--mode",
+                  "fast", "--split", "train", "--samples", "0"])  # fmt: skip
+    report = json.loads((out / "scores" / "laptop-scapo-cpu-seed1-fast.json").read_text())
+    assert report["split"] == "train"
+    assert report["calibration"] is None
+    assert (out / PAGE).is_file()
+
+
 def test_another_question_is_answered_anew(tmp_path, monkeypatch) -> None:
     for name, count in (("data", 4), ("more", 5)):
         made.make_data(tmp_path / name, "laptop", count=count, train=6, points=96)
