@@ -231,7 +231,8 @@ class _Files:
         self.scores, self.out = scores.resolve(), out.resolve()
         self.paths: dict[str, list[Path]] = {}
         for run in results.all_runs():
-            self.paths.setdefault(display_name(series_of(run)), []).append(run.path.resolve())
+            path = self.scores / run.path.relative_to(scores)  # which may be a link to elsewhere
+            self.paths.setdefault(display_name(series_of(run)), []).append(path)
 
     def of(self, row: Row) -> str:
         """The files of a row: reports, then what lies in ladders/ and pictures/ beside scores/."""

@@ -70,6 +70,16 @@ def test_every_link_leads_somewhere_and_nothing_is_loaded_from_elsewhere(folder:
     assert "<b onload" not in text
 
 
+def test_scores_may_be_links_to_elsewhere(tmp_path: Path):
+    make_scores(tmp_path / "runs", "scapo", "laptop")
+    for path in [path for path in (tmp_path / "runs").rglob("*") if path.is_file()]:
+        link = tmp_path / "scores" / path.name
+        link.parent.mkdir(exist_ok=True)
+        link.symlink_to(path)
+    write.make_tables(tmp_path / "scores").write(tmp_path / "tables", page=True)
+    assert 'href="../scores/' in (tmp_path / "tables" / PAGE).read_text()
+
+
 def test_a_row_has_the_means_of_the_table(folder: Path):
     text = (folder / "tables" / PAGE).read_text()
     line = next(row for row in text.split("<tr") if ">SCAPO</a>" in row)
