@@ -144,7 +144,8 @@ class Predictor:
                 values = np.array(values, np.float32, order="C")  # any strides and byte order
         elif values.is_complex():
             raise ValueError(f"expected real numbers, found a tensor of {values.dtype}")
-        return torch.as_tensor(values, dtype=torch.float32, device=self.device)
+        made = torch.as_tensor(values, dtype=torch.float32, device=self.device)
+        return made.detach().contiguous()  # another layout is rounded otherwise
 
 
 def _check_coordinates(cloud: Tensor) -> None:
