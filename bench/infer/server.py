@@ -72,7 +72,8 @@ logger = logging.getLogger(__name__)
 class Upload(Request):
     """A request whose files are stored in the server's folder, and which ends in time."""
 
-    max_form_memory_size = OTHER_FIELDS
+    max_form_memory_size = 2 * OTHER_FIELDS
+    """Also of a file's piece of 64 KiB with the line before it, which may begin the form's end."""
     max_form_parts = FIELDS
     folder: str
 

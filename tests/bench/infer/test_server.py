@@ -107,6 +107,7 @@ def test_a_result_says_what_named_its_model(given, told, cloud, tmp_path):
         (b"x", "a.png", {"intrinsics": "/etc/passwd"}, 400, "camera: expected fx,fy,cx,cy"),
         (b"x", "a.png", {"intrinsics": "a,b,c,/etc/passwd"}, 400, "camera: expected fx"),
         (b"x", "a.ply", {"category": "ship"}, 400, "expected a category of this page"),
+        (b"0 1 2\n" * 150_000, "a.ply", {}, 422, "a.ply: expected a PLY header"),  # large, of lines
         (bytes(1_200_000), "a.ply", {}, 413, "expected a file of at most 1 MB"),
         (bytes(18_000_000), "a.ply", {}, 413, "expected an upload of at most 1 MB, found"),
     ],
