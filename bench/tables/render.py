@@ -169,7 +169,8 @@ def _over(table: Table) -> list[str]:
 
 def _latex_row(row: Row) -> str:
     checks = _checks(row, r"$\checkmark$", "--")
-    return " & ".join([escape(row.method), row.source, *checks, *map(_latex, row.cells)]) + r" \\"
+    name = re.sub(r"^(?=[\[*])", "{}", escape(row.method))  # else an argument of the row before
+    return " & ".join([name, row.source, *checks, *map(_latex, row.cells)]) + r" \\"
 
 
 def _latex(cell: Cell) -> str:

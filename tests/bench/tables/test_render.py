@@ -11,7 +11,7 @@ import pytest
 from bench.tables.write import make_tables
 from tests.helpers.scored import make_scores
 
-NAMES = ["=HYPERLINK(1)", "+1", "-1+2", "@x", "<img src=x onerror=alert(1)>", "a|b", "[c](d)",
+NAMES = ["=HYPERLINK(1)", "+1", "-1+2", "@x", "<img src=x onerror=alert(1)>", "a|b", "[c](d)", "*a",
          "$\\frac{$", "\\input{x}", "R&D"]  # fmt: skip
 
 
@@ -33,3 +33,4 @@ def test_a_name_is_text_in_every_form(name, tmp_path):
     assert len(widths) == 1
     assert "\\input{" not in texts["table1.tex"]
     assert "\\frac{" not in texts["table1.tex"]
+    assert not re.search(r"\\\\\s*[\[*]", texts["table1.tex"])  # an argument of the end of a row
