@@ -36,6 +36,8 @@ MOST_STRETCH = 1.5
 """Of fx and fy: pixels are about square."""
 OPENCV = re.compile(r"\A%YAML:.*|!!opencv-[\w-]+")
 """What its FileStorage writes beside YAML."""
+SIZES = (("width", "image_width"), ("height", "image_height"))
+"""What files of cameras call the sides of their image."""
 MATRICES = ("K", "k", "cam_K", "camera_matrix", "intrinsic_matrix", "intrinsics")
 
 
@@ -163,7 +165,7 @@ def read_intrinsics(text: str, width: int, height: int) -> Intrinsics:
     Raises:
         InputError: No four numbers and no such file, or no camera of this image.
     """
-    values = _numbers(text) if "," in text else _from_file(Path(text))
+    values = _numbers(text) if "," in text else _from_file(Path(text), (width, height))
     fx, fy, cx, cy = values
     where = f"--intrinsics {text}"
     if not all(isfinite(value) for value in values) or min(fx, fy) <= 0:
@@ -195,7 +197,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     return values
 
 
-def _from_file(path: Path) -> tuple[float, ...]:
+def _from_file(path: Path, size: tuple[int, int]) -> tuple[float, ...]:
     """From the names that calibrations use: a matrix K (rows; Open3D's columns), or fx, fy, ..."""
     import yaml  # also reads JSON
 
@@ -207,6 +209,7 @@ def _from_file(path: Path) -> tuple[float, ...]:
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON or YAML, found {_problem(error)}") from error
     named = cast("Mapping[str, Any]", record) if isinstance(record, Mapping) else {}
+    _check_size(path, named, size)
     for name in MATRICES:
         if name not in named:
             continue
@@ -222,6 +225,21 @@ def _from_file(path: Path) -> tuple[float, ...]:
         found = f"the values {values}" if whole else f"{list(named)[:9]}"
         raise InputError(f"{path}: expected a matrix K or numbers fx, fy, cx, cy, found {found}")
     return tuple(float(cast("float", value)) for value in values)
+
+
+def _check_size(path: Path, named: Mapping[str, Any], size: tuple[int, int]) -> None:
+    """Refuse the camera of an image of another width or height, where the file says them.
+
+    Raises:
+        InputError: It does.
+    """
+    said = [next((named[name] for name in names if name in named), None) for names in SIZES]
+    pairs = zip(said, size, strict=True)
+    if any(isinstance(one, int | float) and one != side for one, side in pairs):
+        raise InputError(
+            f"{path}: expected the camera of an image of {size[0]} x {size[1]}, found that of one "
+            f"of {said[0]} x {said[1]}"
+        )
 
 
 def _problem(error: Exception) -> str:

@@ -143,6 +143,20 @@ def test_cameras_of_other_images_are_refused(text, message):
     assert text in str(refused.value)
 
 
+@pytest.mark.parametrize("sides", [("width", "height"), ("image_width", "image_height")])
+def test_a_camera_of_another_size_than_the_image_is_refused(sides, tmp_path):
+    """At twice the size its principal point may lie in the image yet."""
+    path = tmp_path / "camera.json"
+    for size, fits in (((WIDTH, HEIGHT), True), ((2 * WIDTH, 2 * HEIGHT), False)):
+        said = dict(zip(sides, size, strict=True))
+        path.write_text(json.dumps({"fx": 120, "fy": 124, "cx": 63.5, "cy": 47, **said}))
+        if fits:
+            assert read_intrinsics(str(path), WIDTH, HEIGHT).fx == 120
+            continue
+        with pytest.raises(InputError, match="an image of 64 x 48, found that of one of 128 x 96"):
+            read_intrinsics(str(path), WIDTH, HEIGHT)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [("{", "JSON or YAML"), ('{"fx": 1,\n "fy": 2', "JSON or YAML, found expected .* in line 2, "),
