@@ -270,12 +270,14 @@ def state_sign(
     """+1 where predicted and true axis agree, -1 where they oppose.
 
     Where the two parts are swapped (`reversed_`, (B,) bool, two parts only), the predicted child
-    is the true base, which moves the other way: the true axis counts as reversed.
+    is the true base, which moves the other way: the true axis counts as reversed. A state without
+    an axis, whether of a sample or of all, is taken as positive towards open: +1.
     """
     if axis_pred is None:
         return np.ones(axis_true.shape[:2])
-    sign = np.where((axis_true * np.asarray(axis_pred, np.float64)).sum(-1) < 0, -1.0, 1.0)
-    return np.where(reversed_[:, None], -sign, sign)
+    along = (axis_true * np.asarray(axis_pred, np.float64)).sum(-1)
+    sign = np.where(along < 0, -1.0, 1.0)
+    return np.where(reversed_[:, None] & np.isfinite(along), -sign, sign)
 
 
 def average_precision(

@@ -195,6 +195,8 @@ def test_states_go_around_the_circle_and_follow_the_axis():
     sign = state_sign(axis, -axis, np.array([False, True]))
     np.testing.assert_array_equal(sign, [[-1], [1]])
     np.testing.assert_array_equal(state_sign(axis, None, np.array([True, False])), 1)
+    lacking = np.full_like(axis, np.nan)  # of these samples alone, and so alike
+    np.testing.assert_array_equal(state_sign(axis, lacking, np.array([True, False])), 1)
 
 
 def precision_inputs(seed=0, count=200, parts=2) -> dict[str, Any]:
