@@ -94,6 +94,12 @@ def write_bytes(path: Path | str, data: bytes) -> None:
             temporary.unlink()
 
 
+def remove_half_written(folder: Path) -> None:
+    """Remove what `write_bytes` left in a folder, where nobody writes now, when it was killed."""
+    for path in folder.glob(f".{'[0-9a-f]' * 16}.tmp"):
+        path.unlink(missing_ok=True)
+
+
 def write(path: Path | str, arrays: Mapping[str, np.ndarray], header: Header) -> str:
     """Write arrays and header atomically; the same input gives the same bytes.
 

@@ -28,7 +28,7 @@ from torch.optim import Optimizer
 
 from scapo.method import AbstractMethod, Journal, Stage, Step
 from scapo.store import checkpoint
-from scapo.store.files import Arrays
+from scapo.store.files import Arrays, remove_half_written
 from scapo.store.folders import alone
 from scapo.store.samples import TrainingData
 from scapo.store.schema import StoreError
@@ -173,6 +173,8 @@ class Trainer:
         path = self.folder.path
         held = alone(path, "training") if self.ranks.first else contextlib.nullcontext()
         with self._explained(), held:
+            if self.ranks.first:
+                remove_half_written(path)
             if self.folder.found(resume=resume):
                 finished, moments = self.folder.load(self.state, self.ranks.rank)
             elif self.ranks.first:

@@ -170,21 +170,28 @@ class Passed:
     one: Pass
     before: Float[Tensor, "B S 4 4"]
     """The cloud of this pass to the aligned cloud, of every slot."""
-    state: Float[Tensor, "B S"]
-    """Joint states that were undone."""
+    undone: Float[Tensor, "B S 3"]
+    """How far each slot was moved back against the base, along the axis of the pass that said so:
+    another anchor may name it the other way round."""
 
     def poses(self) -> Float[Tensor, "B S 4 4"]:
         """Canonical frame to the aligned cloud."""
         return self.before @ self.one.poses()
 
+    def base(self) -> Float[Tensor, "B 4 4"]:
+        """That of the base."""
+        return gather(self.poses().flatten(2), self.one.chosen.order()[:, :1]).view(-1, 4, 4)
+
+    def axis(self) -> Float[Tensor, "B 1 3"]:
+        """Of all joints, in the aligned frame."""
+        return (self.base()[:, :3, :3] @ self.one.chosen.axis[:, 0, :, None])[:, None, :, 0]
+
     def joints(self) -> tuple[Tensor, Tensor, Tensor]:
         """Pivots (B, J, 3), axes (B, J, 3) and states (B, J) of the moving slots, base first."""
-        one, order = self.one.chosen, self.one.chosen.order()
-        base = gather(self.poses().flatten(2), order[:, :1]).view(-1, 4, 4)
-        pivots = apply(base, gather(one.pivots, order[:, 1:]))
-        axis = (base[:, :3, :3] @ one.axis[:, 0, :, None])[:, None, :, 0]
-        state = (one.relative()[..., 0] + self.state).gather(1, order[:, 1:])
-        return pivots, axis.expand_as(pivots), state
+        one, order, axis = self.one.chosen, self.one.chosen.order(), self.axis()
+        pivots = apply(self.base(), gather(one.pivots, order[:, 1:]))
+        state = one.relative()[..., 0] + (self.undone * axis).sum(-1)
+        return pivots, axis.expand_as(pivots), state.gather(1, order[:, 1:])
 
 
 class PartStage(nn.Module):
@@ -293,14 +300,14 @@ class PartStage(nn.Module):
         label = None
         eye = torch.eye(4, dtype=aligned.dtype, device=aligned.device)
         before = eye.expand(len(aligned), self.slots, 4, 4)
-        state = torch.zeros(before.shape[:2], dtype=aligned.dtype, device=aligned.device)
-        out = []
+        undone = torch.zeros_like(before[..., :3, 3])
+        out: list[Passed] = []
         for _ in range(self.config.passes):
             one = self(clouds, label, usual)
-            out.append(Passed(one=one, before=before, state=state))
+            out.append(Passed(one=one, before=before, undone=undone))
             turn = rigid(one.turn, torch.zeros_like(one.turn[:, 0]))
             motion = (one.poses() @ invert(turn)[:, None]).detach()
             clouds = apply(invert(motion), clouds)
             before, label = before @ motion, one.weights.argmax(-1)
-            state = state + one.chosen.relative()[..., 0].detach()
+            undone = undone + (out[-1].axis() * one.chosen.relative()).detach()
         return out

@@ -139,6 +139,17 @@ def test_a_killed_run_continues_bit_for_bit(whole: Path, tmp_path: Path) -> None
     same(whole, tmp_path)
 
 
+def test_what_a_killed_run_left_half_written_is_removed(whole: Path, tmp_path: Path) -> None:
+    """Or each kill amid a save would leave a file as large as the run for good."""
+    half, foreign = tmp_path / ".00112233445566ff.tmp", tmp_path / ".mine.tmp"
+    for path in (half, foreign):
+        path.write_bytes(b"half")
+    run(tmp_path, resume=True)
+    assert foreign.exists()
+    assert not half.exists()
+    same(whole, tmp_path)
+
+
 def test_a_finished_run_is_left_as_it_is(whole: Path) -> None:
     before = (whole / TRAINING).read_bytes()
     run(whole, resume=True)

@@ -14,14 +14,14 @@ from torch.testing import assert_close
 from bench.baselines.eap import losses
 from bench.baselines.eap.layers import EncoderConfig, SlotAttention
 from bench.baselines.eap.method import PARTS, USUAL, WHOLE, Eap, EapConfig, cpu_config, spread
-from bench.baselines.eap.parts import Kinematics, PartConfig, Usual
+from bench.baselines.eap.parts import Kinematics, PartConfig, Pass, Usual
 from bench.baselines.eap.whole import WholeConfig
 from scapo.categories import CATEGORIES
 from scapo.equivariant.anchors import icosahedron
 from scapo.equivariant.epn import SeparableBlock
 from scapo.first_weights import initialise
-from scapo.geometry.points import normalise
-from scapo.geometry.rigid import apply
+from scapo.geometry.points import gather, normalise
+from scapo.geometry.rigid import apply, invert, joint_motion
 from scapo.method import Step, StepDecay
 from scapo.training.optimiser import learning_rate
 from scapo.types import Labels
@@ -117,6 +117,32 @@ def test_with_two_parts_both_turn_about_one_pivot() -> None:
                 expected = turn.apply((x - pivot).numpy()) + pivot.numpy()
                 np.testing.assert_allclose(apply(motions[b, s, k], x).numpy(), expected, atol=1e-9)
     assert made.order().tolist() == [[0, 1], [1, 0]]
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_pass_may_name_the_axis_the_other_way_round(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The state of both passes together is that of the poses, about the axis of the last one."""
+    made, points = tiny(), normal(8, 2, 6, 3)
+    first = kinematics(kind, slots=2).only(torch.tensor([0, 1]))
+    second = replace(first, axis=-first.axis, states=normal(9, 2, 2, 1))
+    told = iter([
+        Pass(
+            points=points,
+            weights=normal(10, 2, 6, 2).softmax(-1),
+            anchor=torch.tensor([0, 1]),
+            turn=torch.eye(3, dtype=points.dtype).expand(2, 3, 3),
+            chosen=one,
+        )
+        for one in (first, second)
+    ])  # fmt: skip
+    monkeypatch.setattr(made.part_stage, "forward", lambda *_: next(told))
+    last = made.part_stage.passes(points, Usual())[-1]
+    order = last.one.chosen.order()
+    base, child = gather(last.poses().flatten(2), order).unflatten(2, (4, 4)).unbind(1)
+    pivot, axis, state = (value[:, 0] for value in last.joints())
+    assert_close(child @ invert(base), joint_motion(pivot, axis, state, first.kind))
 
 
 @torch.no_grad()
