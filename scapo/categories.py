@@ -71,6 +71,15 @@ class Category:
     words: tuple[str, ...] = ()
     """Link or semantic names that tell the moving parts of this category."""
 
+    @property
+    def turns_over(self) -> bool:
+        """Whether `symmetry` turns the object upside down.
+
+        Then its two readings differ by shape and by where cameras stand, as of laptops; those of a
+        basket by neither.
+        """
+        return self.symmetry is not None and self.symmetry[2][2] < 0
+
 
 def check_category(kind: Category) -> None:
     """Refuse what cannot be: categories that others define come with mistakes.

@@ -130,7 +130,7 @@ class Course:
 
     def __init__(
         self,
-        kinds: tuple[JointKind, ...],
+        like: ArticulatedTemplate,
         generator: torch.Generator,
         plan: Mapping[str, float],
         journal: Journal,
@@ -138,7 +138,7 @@ class Course:
         """At its beginning.
 
         Args:
-            kinds: Of the joints.
+            like: A template of the category.
             generator: Of all that is drawn.
             plan: As `plan_of` makes it.
             journal: Told of the steps; keeps them.
@@ -146,7 +146,7 @@ class Course:
         self.generator, self.plan, self.journal = generator, plan, journal
         self.usual, self.spent = 0.0, 0.0  # Seconds of the steps that were taken
         makers: dict[str, Callable[..., Any]] = {kind.__name__: kind for kind in RECORDS}
-        makers[ArticulatedTemplate.__name__] = partial(_template, kinds)
+        makers[ArticulatedTemplate.__name__] = partial(_template, like)
         self.makers = {**makers, OrientationScorer.__name__: _scorer}
 
     def step(self, name: str, make: Callable[[], T]) -> T:
@@ -173,8 +173,8 @@ class Course:
         return made
 
 
-def _template(kinds: tuple[JointKind, ...], **state: Tensor) -> ArticulatedTemplate:
-    made = ArticulatedTemplate(kinds, len(state["points"]))
+def _template(like: ArticulatedTemplate, **state: Tensor) -> ArticulatedTemplate:
+    made = like.with_points(len(state["points"]))
     made.load_state_dict(state)
     return made
 

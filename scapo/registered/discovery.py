@@ -69,7 +69,7 @@ class Discovery:
 
 def discover(
     views: PartialViews,
-    kinds: tuple[JointKind, ...],
+    like: ArticulatedTemplate,
     config: DiscoveryConfig,
     generator: torch.Generator,
     objects: Sequence[PartialViews] = (),
@@ -79,28 +79,28 @@ def discover(
 
     Args:
         views: All that is learned from.
-        kinds: Of the joints.
+        like: A template of the category: its joints, and where cameras may stand.
         config: How much is tried.
         generator: Of all that is drawn.
         objects: Views of one object each, where it is known which show the same.
         journal: Told of every step; keeps them.
     """
+    kinds = like.kinds
     plan = plan_of(config, kinds, len(views.points), len(objects))
-    course = Course(kinds, generator, plan, journal)
+    course = Course(like, generator, plan, journal)
     judges, others = (take(views, k) for k in held_out(len(views.points), config.judged))
-    total = len(others.points)
     shown = None
-    half: Searched = take(others, evenly(total, config.searched // 2))
-    searched: Searched = take(others, evenly(total, config.searched))
     if objects:
         config = replace(config, way_out=False)  # the objects' own motions tell the axes
         known = _known_objects(objects, kinds, config, course)
         tried = _of_objects(known, kinds, config, course)
         shown = owned_views(known, kinds)
-        half = shown.some(config.searched // 2, objects=len(known) // 2)
-        searched = shown.some(config.searched)
     else:
         tried = _of_draws(others, kinds, config, course)
+    for one in tried:
+        one.template.mirrored = like.mirrored
+    exchanged = not config.together and len(kinds) == 1
+    half, searched = _searched(others, None if exchanged else shown, config)
     best = _best(tried, judges, half, config, course)
     best = _through_rounds(best, judges, (half, searched), config, course)
     dense = partial(densified, best, config, generator, config.dense_rounds)
@@ -122,6 +122,25 @@ def held_out(total: int, count: int) -> tuple[Int[Tensor, " J"], Int[Tensor, " K
     judges = evenly(total, min(count, total // JUDGES))
     rest = torch.ones(total, dtype=torch.bool).index_fill(0, judges, False)
     return judges, rest.nonzero()[:, 0]
+
+
+def _searched(
+    views: PartialViews, objects: OwnedViews | None, config: DiscoveryConfig
+) -> tuple[Searched, Searched]:
+    """What the rounds search, half of it first: single views, or those of objects that vote.
+
+    Not of objects whose base a symmetry exchanges with the part: as their views were registered,
+    one half was taken for the other in every third (row 658).
+    """
+    if objects is None:
+        some = (
+            evenly(len(views.points), count) for count in (config.searched // 2, config.searched)
+        )
+        half, every = (take(views, rows) for rows in some)
+        return half, every
+    count = int(objects.owner.max()) + 1
+    half = objects.some(config.searched // 2, objects=count // 2)
+    return half, objects.some(config.searched)
 
 
 def _of_draws(

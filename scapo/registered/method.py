@@ -152,10 +152,10 @@ class TemplateRegistration(AbstractRegistered):
 
     def _ask_deviation(self, cloud: Float[Tensor, "B N 3"], generator: torch.Generator) -> None:
         """Take a template whose hinges deviate, if it explains clouds far better."""
-        kinds, learned = self.template.kinds, self.config.learned
+        learned = self.config.learned
         axes, search = "deviating axes again", "search of all views again"
         plan = {axes: DEVIATION + VIEW * LEANING, search: VIEW * learned}
-        course = Course(kinds, generator, plan, self.journal)
+        course = Course(self.template, generator, plan, self.journal)
         asked = cloud[evenly(len(cloud), LEANING).to(cloud.device)].cpu()
         made = course.step(axes, partial(self._deviating, asked, generator))
         if not made.template.deviates():
@@ -262,14 +262,14 @@ class TemplateRegistration(AbstractRegistered):
         generator: torch.Generator,
     ) -> Discovery:
         """By registration and bundle adjustment of the views."""
-        kinds, config = self.template.kinds, self.config.discovery
+        config, like = self.config.discovery, self.template
         objects = list[PartialViews]()
         if labels.instance is not None:
             rows = grouped(labels.instance.cpu(), config)
             objects = [self._of_one_size(observation.points[own].cpu()) for own in rows]
             if not objects:
                 logger.warning("too few clouds of any one object: which show the same is not used")
-        return discover(learned.views, kinds, config, generator, objects, self.journal)
+        return discover(learned.views, like, config, generator, objects, self.journal)
 
     def _learn_orientation(self, views: PartialViews, made: Discovery, seed: Tensor) -> None:
         """Where the network learns what stands as its object does."""

@@ -73,6 +73,27 @@ class PartPoses:
     translation: Float[Tensor, "B P 3"]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mirror:
+    """A reflection of the template's frame that takes each hinge to itself or to the other one."""
+
+    flip: Float[Tensor, "3 3"]
+    middle: Float[Tensor, " 3"]
+    """Of the plane, unscaled; along its normal."""
+    order: Int[Tensor, " J"]
+    """Hinge j is the image of hinge order[j]."""
+    sense: Float[Tensor, " J"]
+    """Its state is so many times that one's."""
+
+    def placement(self, placement: Placement) -> Placement:
+        """Of the mirror images of views: states, shifts and sizes, poses as they were."""
+        return replace(
+            placement,
+            state=placement.state[:, self.order] * self.sense,
+            shift=placement.shift[:, self.order] @ self.flip,
+        )
+
+
 class ArticulatedTemplate(nn.Module):
     """Oriented points with part weights, and the joints that move them."""
 
@@ -96,11 +117,13 @@ class ArticulatedTemplate(nn.Module):
     """(2 J, 2 J) covariance of observed part rotations that no deviation explains."""
     alike: Tensor
     """() 1 where the parts are two like halves, of which neither is favoured as the base."""
+    mirrored: bool
+    """Whether cameras are known to stand to either side of the object alike (`mirror`)."""
 
     def __init__(self, kinds: tuple[JointKind, ...], count: int = 400) -> None:
         """A template of `count` points at the origin, to be filled by `assign`."""
         super().__init__()
-        self.kinds = kinds
+        self.kinds, self.mirrored = kinds, False
         self.points = nn.Parameter(torch.zeros(count, 3))
         self.logit = nn.Parameter(torch.zeros(count, len(kinds) + 1))
         self.axis = nn.Parameter(torch.ones(len(kinds), 3))
@@ -137,6 +160,7 @@ class ArticulatedTemplate(nn.Module):
         made.assign(self.points[:count], self.normals[:count], self.logit[:count])
         for name in ("axis", "pivot", *BUFFERS):
             getattr(made, name).copy_(getattr(self, name))
+        made.mirrored = self.mirrored
         return made
 
     def directions(self) -> Float[Tensor, "J 3"]:
@@ -194,6 +218,26 @@ class ArticulatedTemplate(nn.Module):
             points = points + share * (scaled @ turn + poses.translation[:, p, None])
             normals = normals + share * (self.normals @ turn)
         return points, F.normalize(normals, dim=-1)
+
+    @torch.no_grad()
+    def mirror(self) -> Mirror:
+        """What takes the left side of such objects to their right one, found by the joints.
+
+        One hinge lies across the plane, of two one lies to either side of it.
+        """
+        axis, count = self.directions(), len(self.kinds)
+        normal = axis[0] if count == 1 else F.normalize(self.pivot[0] - self.pivot[1], dim=0)
+        if count > 1:  # objects are scaled along the template's axes
+            normal = F.one_hot(normal.abs().argmax(), 3).to(normal)
+        flip = torch.eye(3).to(normal) - 2 * normal[:, None] * normal
+        order = torch.arange(count, device=normal.device).flip(0)
+        turned = -axis[order] @ flip  # an axis is no vector: mirror images turn the other way
+        return Mirror(
+            flip=flip,
+            middle=ends(self.points @ normal).mean() * normal,
+            order=order,
+            sense=(axis * turned).sum(-1).sign(),
+        )
 
     @torch.no_grad()
     def part_centres(self) -> Float[Tensor, "P 3"]:

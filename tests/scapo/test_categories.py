@@ -62,6 +62,26 @@ def test_the_symmetry_is_half_a_turn(known: Category) -> None:
 
 
 @every
+def test_readings_of_what_turns_over_have_cameras_elsewhere(known: Category) -> None:
+    """From above one, from below the other; of what does not turn over both are in the window."""
+    if known.symmetry is None:
+        assert not known.turns_over
+        return
+    low, high = np.radians(known.window.elevation)
+    ring = np.radians(np.linspace(*known.window.azimuth, 9))
+    height = np.array([low, (low + high) / 2, high])[:, None]
+    shape = np.broadcast_shapes(ring.shape, height.shape)
+    cameras = np.stack([
+        -np.cos(ring) * np.cos(height), -np.sin(ring) * np.cos(height),
+        np.broadcast_to(np.sin(height), shape),
+    ], -1)  # fmt: skip
+    turned = cameras @ np.array(known.symmetry, float)
+    inside = np.arcsin(turned[..., 2]) >= low - 1e-9
+    assert inside.all() != known.turns_over
+    assert inside.any() != known.turns_over
+
+
+@every
 def test_the_window_is_where_a_person_looks_from(known: Category) -> None:
     """About the front, not from below, never exactly overhead, and wide enough to vary."""
     low, high = known.window.azimuth

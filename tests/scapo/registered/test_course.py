@@ -24,7 +24,7 @@ from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pose_search import Hypotheses, SearchResult
-from scapo.registered.template import Placement
+from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.views import PartialViews
 from scapo.training.journal import StoredJournal
 from scapo.types import Labels, Observation
@@ -115,7 +115,9 @@ def light(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def discovered(journal: Journal, objects: int, config: DiscoveryConfig = FEW) -> torch.Tensor:
     views, _ = shown()
-    found = discovery.discover(views, KINDS, config, generator(3), [views] * objects, journal)
+    found = discovery.discover(
+        views, ArticulatedTemplate(KINDS), config, generator(3), [views] * objects, journal
+    )
     assert (found.scorer is None) == (objects == 0 or not config.standing)
     return found.template.pivot.detach()
 
@@ -159,7 +161,7 @@ def test_time_left_goes_by_the_usual_times_and_then_by_the_pace(
     now, journal = [0.0], Told()
     monkeypatch.setattr(room.time, "monotonic", lambda: now[0])
     plan = dict.fromkeys(numbered("step", 10), 100.0)
-    course = Course(KINDS, generator(0), plan, journal)
+    course = Course(ArticulatedTemplate(KINDS), generator(0), plan, journal)
 
     def working() -> None:
         now[0] += 300.0

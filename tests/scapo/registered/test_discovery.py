@@ -26,6 +26,7 @@ from scapo.registered.inliers import find_inliers
 from scapo.registered.joint_proposals import PosedViews
 from scapo.registered.mirror_images import mirrored
 from scapo.registered.pose_search import SearchResult
+from scapo.registered.template import ArticulatedTemplate
 from scapo.registered.views import PartialViews
 from tests.helpers.sighted import AXIS, sighted, template, without_a_side
 from tests.helpers.strategies import generator
@@ -120,7 +121,7 @@ def test_mirror_images_take_the_first_round_on_half_of_the_views(
     for mirror, wanted in expected.items():
         calls.clear()
         config = replace(tried, mirror=mirror)
-        discovery.discover(views, ("revolute",), config, generator(0))
+        discovery.discover(views, ArticulatedTemplate(("revolute",)), config, generator(0))
         assert calls == wanted
 
 
@@ -147,7 +148,7 @@ def test_the_mirror_image_that_completes_the_base_is_kept(
         views, (Inliers(views=views, placement=truth).cameras()[:, 1] > 0.2).nonzero()[:, 0]
     )
     config = DiscoveryConfig(rotations=200)
-    course = Course(("revolute",), generator(0), {}, Journal())
+    course = Course(ArticulatedTemplate(("revolute",)), generator(0), {}, Journal())
     found = completed(start, judges, views, config, course).template
     assert "kept: 2" in caplog.text  # 0 as it was, then its image along x, y, z
     assert (found.normals[found.logit.argmax(-1) == 0, 1] > 0.8).sum() > 15

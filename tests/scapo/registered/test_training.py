@@ -21,6 +21,7 @@ from scapo.registered.discovery import Discovery, discover
 from scapo.registered.method import TemplateRegistration
 from scapo.registered.orientation import OrientationScorer
 from scapo.registered.pose_search import SearchResult
+from scapo.registered.template import ArticulatedTemplate
 from scapo.store.samples import TrainingData
 from scapo.training import fit
 from scapo.training.journal import StoredJournal
@@ -126,7 +127,9 @@ def test_the_same_views_give_the_same_template_interrupted_or_not(
         raise StoppedError
 
     def found(journal: Journal) -> Discovery:
-        return discover(views, ("revolute",), few, generator(3), journal=journal)
+        return discover(
+            views, ArticulatedTemplate(("revolute",)), few, generator(3), journal=journal
+        )
 
     def stored() -> StoredJournal:
         return StoredJournal(tmp_path, {}, "votes", lambda *_: None)

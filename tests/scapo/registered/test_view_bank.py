@@ -207,6 +207,45 @@ def test_a_placed_view_is_not_compared_with_itself(turned: bool):
     assert stranger[0, 0].item() == pytest.approx(0, abs=1e-5)
 
 
+def from_the_other_side(
+    views: PartialViews, placement: Placement
+) -> tuple[PartialViews, Placement]:
+    """Mirror images of views, which show mirror images of objects: of these, themselves."""
+    flip, across = torch.diag(torch.tensor([-1.0, 1, 1])), torch.diag(torch.tensor([1.0, -1, 1]))
+    seen = observe(views.points @ flip, views.camera @ flip)
+    turned = replace(placement, rotation=flip @ placement.rotation @ across)
+    return seen, replace(turned, translation=placement.translation @ flip)
+
+
+@pytest.mark.parametrize("either", [True, False])
+def test_views_from_the_side_where_no_camera_stood_look_like_mirror_images(either: bool) -> None:
+    views, truth = sighted(60, seed=48)
+    camera = (truth.rotation.mT @ views.direction()[..., None])[..., 0]
+    left = (camera[:, 1] > 0.4).nonzero()[:, 0]
+    views, truth, camera = take(views, left), take(truth, left), camera[left]
+    shape = template()
+    shape.mirrored = either
+    bank = ViewBank.placed(shape, ShownPoints.of(views), truth, camera)
+    assert len(bank.look) == len(left) * (1 + either)
+    right, placed = from_the_other_side(views, truth)
+    odd = replace(bank, key=None).unlikeness(right, placed.rotation[:, None])[:, 0]
+    own = replace(bank, key=None).unlikeness(views, truth.rotation[:, None])[:, 0]
+    most = UNLIKE * UNLIKE_WEIGHT
+    if not either:
+        assert (odd > 0.95 * most).float().mean() > 0.8
+        return
+    torch.testing.assert_close(odd, own, atol=0.1 * most, rtol=0)
+    found = bank.propose(right, 1)  # each its own image, or one as like it
+    off = rotation_angle(found.rotation, placed.rotation).rad2deg()
+    assert off.median() < 20
+    torch.testing.assert_close(
+        bank.centre[len(left) :, 0], bank.centre[: len(left), 0] * torch.tensor([1.0, -1, 1]),
+        atol=0.02, rtol=0,
+    )  # fmt: skip
+    there = ViewBank.rendered(shape, still(torch.zeros(1, 1)), camera)
+    assert (-there.look[:, 2, 1]).amin() < -0.5 if either else True
+
+
 def test_what_is_turned_as_wanted_has_the_state_that_looks_alike():
     views, truth = sighted(16, seed=43)
     bank = ViewBank.rendered(template(), still(torch.linspace(0, 1, 5)[:, None]), None)
