@@ -73,12 +73,14 @@ class Category:
 
     @property
     def turns_over(self) -> bool:
-        """Whether `symmetry` turns the object upside down.
+        """Whether `symmetry` turns the object upside down, and people stand before it.
 
-        Then its two readings differ by shape and by where cameras stand, as of laptops; those of a
-        basket by neither.
+        Its two readings then differ by shape, and a camera at the left of one is at the right of
+        the other, as of laptops. Those of a basket are alike; people stand all around scissors.
         """
-        return self.symmetry is not None and self.symmetry[2][2] < 0
+        low, high = self.window.azimuth
+        over = self.symmetry is not None and self.symmetry[2][2] < 0
+        return over and high - low < 360
 
 
 def check_category(kind: Category) -> None:

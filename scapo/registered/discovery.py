@@ -99,7 +99,7 @@ def discover(
         tried = _of_draws(others, kinds, config, course)
     for one in tried:
         one.template.mirrored = like.mirrored
-    exchanged = not config.together and len(kinds) == 1
+    exchanged = like.mirrored and len(kinds) == 1
     half, searched = _searched(others, None if exchanged else shown, config)
     best = _best(tried, judges, half, config, course)
     best = _through_rounds(best, judges, (half, searched), config, course)
@@ -129,8 +129,8 @@ def _searched(
 ) -> tuple[Searched, Searched]:
     """What the rounds search, half of it first: single views, or those of objects that vote.
 
-    Not of objects whose base a symmetry exchanges with the part: as their views were registered,
-    one half was taken for the other in every third (row 658).
+    Not of objects whose base is read as the part from the other side: as their views were
+    registered, one half was taken for the other in every third (row 658).
     """
     if objects is None:
         some = (
