@@ -73,14 +73,15 @@ class Category:
 
     @property
     def turns_over(self) -> bool:
-        """Whether `symmetry` turns the object upside down, and people stand before it.
+        """Whether `symmetry` turns an object of one or two hinges over, and people stand before it.
 
         Its two readings then differ by shape, and a camera at the left of one is at the right of
         the other, as of laptops. Those of a basket are alike; people stand all around scissors.
         """
         low, high = self.window.azimuth
         over = self.symmetry is not None and self.symmetry[2][2] < 0
-        return over and high - low < 360
+        hinges = [joint.kind for joint in self.joints] in (["revolute"], ["revolute"] * 2)
+        return over and hinges and high - low < 360
 
 
 def check_category(kind: Category) -> None:

@@ -101,8 +101,7 @@ class AbstractRegistered(AbstractMethod):
         self.config, self.category = config, category
         kinds: tuple[JointKind, ...] = tuple(joint.kind for joint in category.joints)
         self.template = ArticulatedTemplate(kinds, config.discovery.final_points)
-        hinges = kinds in (("revolute",), ("revolute", "revolute"))
-        self.template.mirrored = category.turns_over and hinges
+        self.template.mirrored = category.turns_over
         sizes = (len(category.parts), len(kinds))
         self.network = (
             ViewNetwork(*sizes, channels=config.channels)
