@@ -236,9 +236,10 @@ def _check_size(path: Path, named: Mapping[str, Any], size: tuple[int, int]) -> 
     said = [next((named[name] for name in names if name in named), None) for names in SIZES]
     pairs = zip(said, size, strict=True)
     if any(isinstance(one, int | float) and one != side for one, side in pairs):
+        found = " x ".join("?" if one is None else str(one) for one in said)
         raise InputError(
             f"{path}: expected the camera of an image of {size[0]} x {size[1]}, found that of one "
-            f"of {said[0]} x {said[1]}"
+            f"of {found}"
         )
 
 

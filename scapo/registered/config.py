@@ -91,7 +91,8 @@ class DiscoveryConfig(TemplateConfig):
     """Points of the template while it is sought."""
     together: bool = True
     """Count what the views of all known objects say among the votes of each; where a symmetry
-    exchanges parts objects are read in two ways, and each votes alone."""
+    exchanges parts objects are read in two ways, and each votes alone, or none where it exchanges
+    the base with a part and cameras stand before the object."""
     standing: bool = True
     """Learn how objects stand, and charge hypotheses by it, where the network learns candidates
     that stand as their objects do. Elsewhere its word and the loss tell better."""

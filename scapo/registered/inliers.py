@@ -11,7 +11,8 @@ gather. Where one half of it was taken for the other in some objects, cameras of
 widely than where they can be. So objects are asked together only where their cameras are spread
 about as widely as those of single views are: of ovens, safes, drawers and scissors 0.91 to 1.12, of
 baskets 0.78, of suitcases 0.73 and 1.15, of washers, on which views know better, about half, of
-laptops 1.4 and 1.5. Nor do they vote together where a symmetry exchanges parts (`config.decided`).
+laptops 1.4 and 1.5. Nor do they vote together where a symmetry exchanges parts (`config.decided`),
+and those of laptops and suitcases do not vote at all (`discovery`).
 """
 
 from __future__ import annotations

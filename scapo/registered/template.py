@@ -86,9 +86,13 @@ class Mirror:
     """Its state is so many times that one's."""
 
     def placement(self, placement: Placement) -> Placement:
-        """Of the mirror images of views: states, shifts and sizes, poses as they were."""
+        """Of the mirror images of views, their frames reflected alike; axes do not deviate."""
+        rotation = self.flip @ placement.rotation @ self.flip
+        beyond = 2 * self.middle * placement.log_scale.exp()
         return replace(
             placement,
+            rotation=rotation,
+            translation=placement.translation @ self.flip - (rotation @ beyond[..., None])[..., 0],
             state=placement.state[:, self.order] * self.sense,
             shift=placement.shift[:, self.order] @ self.flip,
         )

@@ -13,7 +13,7 @@ that were placed (`unlikeness`), without any label.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -24,7 +24,7 @@ from scapo.geometry.points import MEAN_RADIUS
 from scapo.geometry.rigid import rotation_between
 from scapo.records import cat, take
 from scapo.registered.pairwise import distinct, within
-from scapo.registered.template import ArticulatedTemplate, Mirror, Placement
+from scapo.registered.template import ArticulatedTemplate, Placement
 from scapo.registered.view_loss import GRAZING
 from scapo.registered.views import FAR, TINY, PartialViews
 
@@ -124,40 +124,38 @@ class ViewBank:
         placement: Placement,
         camera: Float[Tensor, "V 3"],
     ) -> ViewBank:
-        """Views whose placements are known.
+        """Views whose placements are known, as seen from the other side too where that is known.
+
+        Where no view is placed on one side, a view from there looks like none: it is read another
+        way, if there is one, and so that side stays empty.
 
         Args:
-            template: For its joints.
+            template: For its joints, and what is left and right.
             shown: The views' points, their own frames.
             placement: Of the views.
             camera: Directions to their cameras, template frame.
         """
-        middle, seen, radius = shown.about_centroid()
-        centre = (placement.rotation.mT @ (middle - placement.translation)[..., None])[..., 0]
-        views = _PlacedViews(
-            points=seen @ placement.rotation,
-            normals=shown.normals @ placement.rotation,
-            centre=centre,
-            radius=radius,
-            camera=camera,
-            placement=placement,
-            key=_key(shown.points),
-        )
         if template.mirrored:
-            views = cat([views, views.mirrored(template.mirror())])
-        front = _front(views.camera)
-        look = looks(views.camera, front)
-        some = torch.ones_like(views.points[..., 0])
+            mirror = template.mirror()
+            shown = cat([shown, shown.turned(mirror.flip)])
+            placement = cat([placement, mirror.placement(placement)])
+            camera = torch.cat([camera, camera @ mirror.flip])
+        front = _front(camera)
+        look = looks(camera, front)
+        middle, seen, radius = shown.about_centroid()
+        turn = look @ placement.rotation.mT
+        image = draw(seen @ turn.mT, shown.normals @ turn.mT, torch.ones_like(seen[..., 0]))
+        centre = (placement.rotation.mT @ (middle - placement.translation)[..., None])[..., 0]
         return ViewBank(
             look=look,
-            image=draw(views.points @ look.mT, views.normals @ look.mT, some)[:, None],
-            centre=views.centre[:, None],
-            radius=views.radius[:, None],
+            image=image[:, None],
+            centre=centre[:, None],
+            radius=radius[:, None],
             mode=torch.arange(len(look), device=look.device)[:, None],
-            modes=views.placement,
+            modes=placement,
             slides=template.sliding,
             front=front,
-            key=views.key,
+            key=_key(shown.points),
         )
 
     @torch.no_grad()
@@ -276,6 +274,10 @@ class ShownPoints:
         """The first `POINTS`, which are spread out."""
         return ShownPoints(points=views.points[:, :POINTS], normals=views.normals[:, :POINTS])
 
+    def turned(self, turn: Float[Tensor, "3 3"]) -> ShownPoints:
+        """The same after a rotation or a reflection of the views' frames."""
+        return ShownPoints(points=self.points @ turn.mT, normals=self.normals @ turn.mT)
+
     def about_centroid(
         self,
     ) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V K 3"], Float[Tensor, " V"]]:
@@ -284,40 +286,6 @@ class ShownPoints:
         seen = self.points - middle[:, None]
         radius = seen.norm(dim=-1).mean(-1).clamp_min(TINY)
         return middle, seen * (MEAN_RADIUS / radius)[:, None, None], radius
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _PlacedViews:
-    """Views whose placements are known, in the template's frame."""
-
-    points: Float[Tensor, "V K 3"]
-    """About their centroid, at mean radius 0.25."""
-    normals: Float[Tensor, "V K 3"]
-    centre: Float[Tensor, "V 3"]
-    """The centroid."""
-    radius: Float[Tensor, " V"]
-    """The mean radius that they had."""
-    camera: Float[Tensor, "V 3"]
-    """Directions to their cameras."""
-    placement: Placement
-    """States, shifts and sizes count."""
-    key: Float[Tensor, "V T"]
-
-    def mirrored(self, mirror: Mirror) -> _PlacedViews:
-        """What cameras on the other side would have seen, of objects that are mirror images.
-
-        Where no view is placed on one side, a view from there looks like none: it is read another
-        way, if there is one, and so that side stays empty.
-        """
-        beyond = 2 * mirror.middle * self.placement.log_scale.exp()
-        return replace(
-            self,
-            points=self.points @ mirror.flip,
-            normals=self.normals @ mirror.flip,
-            centre=self.centre @ mirror.flip + beyond,
-            camera=self.camera @ mirror.flip,
-            placement=mirror.placement(self.placement),
-        )
 
 
 def _key(points: Float[Tensor, "B N 3"]) -> Float[Tensor, "B K"]:

@@ -126,31 +126,30 @@ def test_hypotheses_of_a_view_stand_together():
 @torch.no_grad()
 @pytest.mark.parametrize("joints", [1, 2])
 def test_the_mirror_image_of_what_is_placed_is_the_placed_mirror_image(joints: int) -> None:
-    """An object that mirrors itself left and right, in another state: its own image's is that."""
+    """Of an object that mirrors itself left and right, wherever it stands and in any state."""
     g, axis = generator(31), torch.tensor([0.0, 0, 1]) if joints == 2 else torch.tensor([0, 1.0, 0])
+    across, aside = torch.diag(torch.tensor([1.0, -1, 1])), torch.tensor([0.0, 0.2, 0])
     half, side = torch.randn(40, 3, generator=g), torch.arange(40) % 2
-    other = half * torch.tensor([1.0, -1, 1])
+    points = torch.cat([half, half @ across]) + aside
     part = torch.cat([side, side * joints])  # of two each is the other's image
     template = ArticulatedTemplate(("revolute",) * joints, 80)
-    template.assign(
-        torch.cat([half, other]), torch.cat([half, other]), 60.0 * torch.eye(joints + 1)[part]
-    )
+    template.assign(points, points, 60.0 * torch.eye(joints + 1)[part])
     away = torch.tensor([[0.3, 0.5, 0.1], [0.3, -0.5, 0.1]])[:joints]
     template.axis.copy_(axis * torch.tensor([[1.0], [-1.0]])[:joints])
-    template.pivot.copy_(away if joints == 2 else away * torch.tensor([1.0, 0, 1]))
-    eye, none = torch.eye(3).expand(5, 3, 3), torch.zeros(5, 3)
-    placement = Placement.at(eye, none, torch.randn(5, joints, generator=g))
+    template.pivot.copy_(aside + (away if joints == 2 else away * torch.tensor([1.0, 0, 1])))
+    state = torch.randn(5, joints, generator=g)
+    placement = Placement.at(random_rotations(5, g), torch.randn(5, 3, generator=g), state)
     shift = torch.randn(5, joints, 3, generator=g)
     placement = replace(placement, shift=shift, log_scale=0.2 * torch.randn(5, 3, generator=g))
     mirror = template.mirror()
-    assert_close(mirror.flip, torch.diag(torch.tensor([1.0, -1, 1])), atol=1e-6, rtol=0)
-    assert_close(mirror.middle, torch.zeros(3), atol=1e-5, rtol=0)
+    assert_close(mirror.flip, across, atol=1e-6, rtol=0)
+    assert_close(mirror.middle, aside, atol=1e-5, rtol=0)
     found, _ = template.place(mirror.placement(placement))
     expected = template.place(placement)[0] @ mirror.flip
     swapped = torch.cat([expected[:, 40:], expected[:, :40]], 1)
     assert_close(found, swapped, atol=1e-4, rtol=1e-4)
-    twice = mirror.placement(mirror.placement(placement))
-    assert_close(twice.state, placement.state)
+    again = mirror.placement(mirror.placement(placement))
+    assert_close(template.place(again)[0], template.place(placement)[0], atol=1e-4, rtol=1e-4)
 
 
 @torch.no_grad()
