@@ -255,7 +255,7 @@ and scored.
   logs      {demo.out}/logs/
 
 Next: your own depth image or cloud (scapo-bench infer FILE --category oven --out DIR), train one
-yourself (make demo-train, or README, "The four steps of real use"), your own models (scapo-data
+yourself (make demo-train, or README, "The four steps of a benchmark"), your own models (scapo-data
 check PATH), or your own method (docs/bring-your-own-method.md)."""
 
 
