@@ -15,6 +15,7 @@ from scapo.released import find as find_checkpoint
 
 if TYPE_CHECKING:
     from scapo.method import AbstractMethod
+    from scapo.store import Split
     from scapo.store.files import Header
 
 METHODS: dict[str, Method] = {
@@ -64,3 +65,17 @@ def load(run: Path) -> tuple[AbstractMethod, Header]:
         StoreError: As `scapo.released.find` and `scapo.registry.load_method`.
     """
     return load_method(find_checkpoint(run), all_methods())
+
+
+def check_points(method: AbstractMethod, split: Split) -> None:
+    """Refuse clouds that the method cannot answer, before any work.
+
+    Raises:
+        ValueError: They have fewer points than it needs.
+    """
+    found = split.manifest.points
+    if found < method.least_points:
+        raise ValueError(
+            f"{split.folder}: expected clouds of {method.least_points} points or more, as "
+            f"{method.name} needs with these flags, found {found}"
+        )

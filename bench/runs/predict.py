@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from bench.methods import find, load
+from bench.methods import check_points, find, load
 from bench.requests import PredictRequest
 from bench.run_files import TIMING, read_timing
 from bench.runs.train import pick_device
@@ -53,7 +53,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
 
     Raises:
         ValueError: `oracle` for a method that cannot use labels, `up` for one that has no use for
-            it; no clouds at all, or at a time.
+            it; no clouds at all, or at a time; clouds of fewer points than the method needs.
         StoreError: No checkpoint, no such data, or a file of another suffix to write.
     """
     require_suffix(request.out, ".safetensors")
@@ -71,6 +71,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     oracle = _oracle_words(method) if request.oracle else []
     _tell_up(method, known, request)
     split = open_split(request.data, header["category"], request.split)
+    check_points(method, split)
     samples = SampleDataset(split, observed(split))
     chosen = evenly(len(samples), request.limit)
     parts: list[Arrays] = []

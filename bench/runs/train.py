@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from bench.methods import all_methods
+from bench.methods import all_methods, check_points
 from bench.requests import TrainRequest, UsageError
 from bench.run_files import TIMING
 from bench.runs.align import align
@@ -78,7 +78,7 @@ def _fit(
     method = methods[name].build(request.method, kind, generator)
     if method.name != name:
         raise ValueError(f"{name}: expected a method of that name, found {method.name}")
-    _check_points(method, split)
+    check_points(method, split)
     precision = Arithmetic(precision=request.precision, compiled=request.compile, tf32=request.tf32)
     config = fit.FitConfig(
         seed=request.seed,
@@ -119,27 +119,13 @@ def _training_split(request: TrainRequest[Any]) -> Split:
         raise UsageError(said) from error
 
 
-def _check_points(method: AbstractMethod, split: Split) -> None:
-    """Refuse clouds that the method could not answer either, before any work.
-
-    Raises:
-        ValueError: They have fewer points than it needs.
-    """
-    found = split.manifest.points
-    if found < method.least_points:
-        raise ValueError(
-            f"{split.folder}: expected clouds of {method.least_points} points or more, as "
-            f"{method.name} needs with these flags, found {found}"
-        )
-
-
 def _validation(request: TrainRequest[Any], method: AbstractMethod) -> TrainingData | None:
     """The split for validation, where the data have it."""
     try:
         split = open_split(request.data, request.category, request.val_split)
     except StoreError:
         return None
-    _check_points(method, split)
+    check_points(method, split)
     return read_training_data(split)
 
 

@@ -56,10 +56,10 @@ def table_2(results: Results, cells: Cells, wrong: Sequence[Mismatch], rule: ApR
         printed = printed_rows(cells, wrong, "2", [(key, name) for key in PRECISION_KEYS])
         rows = [replace(row, cells=(*row.cells, *(Cell() for _ in MORE))) for row in printed]
         for line, found in ours:
-            row = [_mean(column) for column in zip(*found, strict=True)] if name == MEAN else [
-                _cell(part) for part in found[number]
-            ]  # fmt: skip
-            rows.append(line_row(results, line, row))
+            parts = [part for row in found for part in row] if name == MEAN else found[number]
+            columns = zip(*found, strict=True)
+            row = [_mean(part) for part in columns] if name == MEAN else [_cell(p) for p in parts]
+            rows.append(line_row(results, line, row, parts))
         candidates.append((name.capitalize(), rows))
     higher = (True,) * len(PRECISION_KEYS) + (False, None, None)
     blocks = [Block(heading=name, rows=kept(rows), higher=higher) for name, rows in candidates]

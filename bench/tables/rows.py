@@ -64,20 +64,29 @@ def our_row(
 ) -> Row:
     """A cell per category and, if wanted, their mean."""
     cells = [Cell() if part is None else part.cell for part in parts]
-    seeds = max((len(part.per_seed) for part in parts if part is not None), default=0)
-    row = line_row(results, line, (*cells, averaged(parts)) if mean else cells)
-    return replace(row, seeds=seeds)
+    return line_row(results, line, (*cells, averaged(parts)) if mean else cells, parts)
 
 
-def line_row(results: Results, line: Line, cells: Sequence[Cell]) -> Row:
-    """A row of ours with these cells."""
+def line_row(
+    results: Results, line: Line, cells: Sequence[Cell], parts: Sequence[object] = ()
+) -> Row:
+    """A row of ours with these cells.
+
+    Args:
+        results: For what methods say of themselves.
+        line: What the row is of.
+        cells: Its values.
+        parts: What they are made of, to count training seeds.
+    """
     series = line.series
+    seeds = [len(part.per_seed) for part in parts if isinstance(part, Sampled)]
     return Row(
         method=line.name,
         source="ours",
         marks=marks_of(results, series),
         camera=camera_of(results, series),
         cells=tuple(cells),
+        seeds=max(seeds, default=0),
         ranked=series.method not in REFERENCE and not series.switches and line.ranked,
         plain=display_name(replace(series, switches="")) if series.switches else "",
     )

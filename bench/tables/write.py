@@ -157,12 +157,12 @@ def ablation_of(variant: str) -> str:
 
 
 def _ablation_row(results: Results, line: Line, ablation: str) -> Row:
-    cells: list[Cell] = []
-    for measure in TABLE_3:
-        runs = [line.runs(results, Place("clean", name)) for name in TABLE_1_CATEGORIES]
-        parts = [measured(found, measure, seed) for seed, found in enumerate(runs)]
-        cells.append(averaged(parts))
+    runs = [line.runs(results, Place("clean", name)) for name in TABLE_1_CATEGORIES]
+    columns = [
+        [measured(found, measure, seed) for seed, found in enumerate(runs)] for measure in TABLE_3
+    ]
+    cells = [averaged(parts) for parts in columns]
     variant = line.series.variant
     suffix = f" ({variant})" if variant not in ("", "default") else ""
-    row = line_row(results, line, cells)
+    row = line_row(results, line, cells, [part for parts in columns for part in parts])
     return replace(row, method=ABLATION_NAMES[ablation] + suffix)

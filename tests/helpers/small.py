@@ -105,16 +105,22 @@ POINTS = 160
 
 
 def hinged_data(
-    folder: Path, *, train: int = 12, test: int = 5, color: bool = False, wrong: bool = False
+    folder: Path,
+    *,
+    train: int = 12,
+    test: int = 5,
+    points: int = POINTS,
+    color: bool = False,
+    wrong: bool = False,
 ) -> Path:
     """A train and a test split of two plates that turn, as laptops; colours come with sensors.
 
     `wrong`: labels of other clouds.
     """
     for split, count in (("train", train), ("test", test)):
-        observation, labels = plates(count, POINTS, seed=count)
+        observation, labels = plates(count, points, seed=count)
         if wrong:
-            _, labels = plates(count, POINTS, seed=count + 100)
+            _, labels = plates(count, points, seed=count + 100)
         assert labels.camera_T_part is not None
         assert labels.joints is not None
         assert labels.part is not None
@@ -132,6 +138,6 @@ def hinged_data(
             change["color"] = shades.astype(np.uint8)
             change["sensor"] = np.zeros((count, 3), np.float32)
         write_split(
-            folder / "laptop" / split, split=split, counts=(count,), change=change, points=POINTS
+            folder / "laptop" / split, split=split, counts=(count,), change=change, points=points
         )
     return folder

@@ -211,6 +211,10 @@ def test_bad_input_is_one_line(
     assert "expected laptop/wrong" in fails(
         capsys, "predict", run, "--data", data, *out, "--split", "wrong"
     )
+    few = hinged_data(tmp_path / "few", points=4)
+    assert "points or more, as scapo needs with these flags, found 4" in fails(
+        capsys, "predict", run, "--data", few, *out
+    )
     assert "expected clouds of 300 points or more, as scapo needs with these flags, found" in fails(
         capsys, "train", "scapo", *("--category", "laptop", "--data", data, *out),
         *("--preset", "cpu", "--encoder.neighbours", 300),

@@ -86,6 +86,13 @@ def test_cells_are_means_over_samples_slots_and_seeds(scores, built):
         assert float(mean["value"]) == pytest.approx(np.mean(means), rel=1e-6)
 
 
+def test_a_row_of_each_table_says_of_how_many_seeds_it_is(built):
+    for table, name in ((built[0], "SCAPO"), (built[1], "SCAPO"), (built[2], "Full")):
+        rows = rows_of(table, source="ours", method=name)
+        values = [row["seeds"] for row in rows if row["block"] != "Seconds per cloud"]
+        assert set(values) == {"2"}, table.number
+
+
 def test_intervals_are_resampled_by_instance(scores, built):
     kept = scores[1]
     table = built[0]
