@@ -180,7 +180,7 @@ def test_placed_views_propose_and_tell_what_is_like_them():
     upside = right @ torch.diag(torch.tensor([-1.0, -1.0, 1.0]))
     odd = bank.unlikeness(take(views, asked), torch.stack([right, upside], 1))
     assert (odd[:, 0] <= odd[:, 1]).all()
-    assert (odd[:, 0] < odd[:, 1] - 0.1).float().mean() > 0.6
+    assert (odd[:, 0] < odd[:, 1] - 0.05).float().mean() > 0.6
     assert odd.max() <= UNLIKE * UNLIKE_WEIGHT + 1e-6
 
 
