@@ -49,8 +49,8 @@ ALIKE, SAME_SIDE = 4, 0.9
 """Placed views that a view is compared with, those most like it, and the cosine of directions
 within which their cameras are."""
 UNLIKE, UNLIKE_WEIGHT = 10.0, 1 / 60
-"""Squared distance from which on images have nothing in common, and the loss that counts as one. Where no
-view is placed counts the same, so more would keep a side empty that happens to be so."""
+"""Squared distance from which on images have nothing in common, and the loss that counts as one.
+Where no view is placed counts the same, so more would keep a side empty that happens to be so."""
 TOLD_BY, SAME = 3, 1e-4
 """Points by whose distances from the middle a view is known again, and normalised length up to
 which these are the same."""
