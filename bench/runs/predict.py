@@ -74,8 +74,7 @@ def predict(request: PredictRequest, watch: Watch = iter) -> tuple[int, float]:
     check_points(method, split)
     samples = SampleDataset(split, observed(split))
     chosen = evenly(len(samples), request.limit)
-    parts: list[Arrays] = []
-    seconds = 0.0
+    parts, seconds = list[Arrays](), 0.0
     for index in watch(chosen.split(request.batch)):
         batch = samples.batch(index)
         started = time.perf_counter()
