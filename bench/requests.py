@@ -18,6 +18,7 @@ import tyro
 from bench.matching import LabelOrder
 from bench.metrics import ApRule, IouKind, PivotKind, RotationKind
 from scapo.ranges import ANY, CountOrNone, Port, Positive, Seed
+from scapo.text import UsageError
 
 Mode = Literal["fast", "quick", "refine", "whole"]
 """`scapo.method.Mode`, written out: that module loads torch."""
@@ -29,10 +30,6 @@ Kind = Literal["constant", "oracle-pose"]
 """The answers of `reference`."""
 
 M = TypeVar("M")
-
-
-class UsageError(ValueError):
-    """Words of a command that ask for nothing: it ends 2, as a parser's refusal does."""
 
 
 def _some(name: str) -> Any:  # noqa: ANN401 - tyro does not name its type

@@ -20,6 +20,10 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 """What a spreadsheet would compute, after any number of the quotes that prevent it."""
 
 
+class UsageError(ValueError):
+    """Words of a command that a parser could not know to be wrong: it ends 2, as a refusal does."""
+
+
 def one_line(text: object, longest: int = LONGEST) -> str:
     r"""Text on one line, without what a terminal would obey, at most `longest` characters.
 

@@ -16,13 +16,14 @@ from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
 from bench.analysis.reference import RECIPE, training_split, write_answers, write_reference
-from bench.requests import EvaluateRequest, Kind, ReferenceRequest, Request, Settings, UsageError
+from bench.requests import EvaluateRequest, Kind, ReferenceRequest, Request, Settings
 from bench.scoring.evaluate import evaluate, open_data
 from bench.scoring.score_files import SUFFIX, read_report
 from scapo.store import Split, StoreError, open_split, sha256_file
 from scapo.store.files import tensor_names
 from scapo.store.provenance import commit
 from scapo.store.split import data_name
+from scapo.text import UsageError
 
 FOLDER = "references"
 """Beside the scores of methods."""

@@ -15,10 +15,9 @@ from rich.logging import RichHandler
 
 from bench.cli.console import say
 from bench.cli.verbs import VERBS, prepare, train_verb
-from bench.requests import UsageError
 from scapo.interrupt import exit_if_unheard, exit_interrupted
 from scapo.ranges import check_numbers
-from scapo.text import empty_flag, unknown_word, words_of
+from scapo.text import UsageError, empty_flag, unknown_word, words_of
 
 DESCRIPTION = (
     "Train, predict, score and tabulate methods of articulated pose estimation "

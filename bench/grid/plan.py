@@ -25,6 +25,7 @@ from scapo.store import StoreError, canonical_json, sha256_bytes, sha256_file, w
 from scapo.store.json_records import read_json, readable_json
 from scapo.store.manifest import read_manifest
 from scapo.store.provenance import PACKAGE, commit
+from scapo.text import UsageError
 
 FORMAT = "scapo-plan/1"
 PLAN = "plan.json"
@@ -345,7 +346,7 @@ def chosen(chains: Sequence[Chain], only: Sequence[str]) -> list[Chain]:
             several joined by `/`; a chain is taken if all patterns of one item fit it.
 
     Raises:
-        ValueError: An item that fits nothing.
+        UsageError: An item that fits nothing.
     """
     if not only:
         return list(chains)
@@ -360,7 +361,7 @@ def chosen(chains: Sequence[Chain], only: Sequence[str]) -> list[Chain]:
         if not fitting:
             labels = ", ".join(dict.fromkeys(chain.label for chain in chains))
             parts = ", ".join(dict.fromkeys(chain.part for chain in chains))
-            raise ValueError(
+            raise UsageError(
                 f"only: expected parts ({parts}), categories, methods ({labels}), seed1, ... or "
                 f"these joined by /, found {item!r}"
             )

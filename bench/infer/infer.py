@@ -14,9 +14,9 @@ from bench.infer.cloud import Cloud, InputError
 from bench.infer.files import Choice, Result, write_result
 from bench.infer.model import Model, load_models
 from bench.infer.readers import ReadOptions, find_inputs, read_input
-from bench.requests import InferRequest, Mode, UsageError, require_some
+from bench.requests import InferRequest, Mode, require_some
 from bench.runs.train import pick_device
-from scapo.text import is_word, one_line, words_of
+from scapo.text import UsageError, is_word, one_line, words_of
 
 CLOSE = 0.05
 """Difference of residuals from which on one category explains a view clearly better."""

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from bench.infer.calibration import Calibration, calibration_file, read_calibration
 from bench.methods import load
-from bench.requests import Mode, UsageError
+from bench.requests import Mode
 from scapo.categories import Category
 from scapo.predictor import Predictor
 from scapo.released import find, released
 from scapo.store.checkpoint import WEIGHTS, check_header, weights_file
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
-from scapo.text import did_you_mean
+from scapo.text import UsageError, did_you_mean
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from bench.methods import all_methods, check_points
-from bench.requests import TrainRequest, UsageError
+from bench.requests import TrainRequest
 from bench.run_files import TIMING
 from bench.runs.align import align
 from bench.runs.report import REPORT, write_report
@@ -24,7 +24,7 @@ from scapo.store.checkpoint import WEIGHTS
 from scapo.store.definitions import category_of
 from scapo.store.samples import TrainingData, read_training_data
 from scapo.store.schema import StoreError
-from scapo.text import unknown_word
+from scapo.text import UsageError, unknown_word
 from scapo.training import fit
 from scapo.training.distributed import joined, own_device
 from scapo.training.precision import Arithmetic

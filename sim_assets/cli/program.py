@@ -13,9 +13,9 @@ from rich.console import Console
 
 from scapo.interrupt import exit_if_unheard, exit_interrupted
 from scapo.ranges import check_numbers
-from scapo.text import empty_flag, unknown_word, words_of
+from scapo.text import UsageError, empty_flag, unknown_word, words_of
 from sim_assets.cli.console import say
-from sim_assets.cli.verbs import VERBS, UsageError
+from sim_assets.cli.verbs import VERBS
 
 DESCRIPTION = (
     "Make and look at labelled point clouds of articulated objects (--version: of which release)."

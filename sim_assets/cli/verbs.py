@@ -18,7 +18,7 @@ from rich.console import Console
 
 from scapo.categories import CATEGORIES, Category
 from scapo.ranges import CountOrNone, Port, Positive, Range, Seed
-from scapo.text import did_you_mean
+from scapo.text import UsageError, did_you_mean
 from sim_assets.cli.console import progress_bar, say, say_each, show_made
 from sim_assets.options import DataOptions
 
@@ -32,10 +32,6 @@ NameOfAny = Annotated[str, tyro.conf.arg(metavar="{" + ",".join([*CATEGORIES, ".
 """One of the package's categories or of a file's."""
 MOST_POINTS = 1 << 24
 """`scapo.store.manifest.MAX_POINTS`, written out: that module takes time to import."""
-
-
-class UsageError(ValueError):
-    """A word of the command line that the parser could not know to be wrong."""
 
 
 def find(name: str, file: Path | None) -> Category:

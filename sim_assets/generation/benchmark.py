@@ -19,7 +19,7 @@ from typing import Any, Literal, get_args
 from scapo.categories import CATEGORIES
 from scapo.store import write_bytes
 from scapo.store.json_records import from_json, read_json, readable_json
-from scapo.text import one_line
+from scapo.text import UsageError, one_line
 from sim_assets.generation.assets import Asset, UrdfAsset
 from sim_assets.generation.generate import Made, Running, generate, open_workers
 from sim_assets.generation.plan import Request
@@ -128,7 +128,7 @@ def pieces(only: Sequence[str] = (), real: RealModels | None = None) -> list[Pie
         real: The user's models, which add a piece for each category that they have.
 
     Raises:
-        ValueError: A word that names nothing, or an item that names no piece.
+        UsageError: A word that names nothing, or an item that names no piece.
     """
     every = [
         Piece(part=part, category=name, split=split)
@@ -148,7 +148,7 @@ def pieces(only: Sequence[str] = (), real: RealModels | None = None) -> list[Pie
         if not found:
             parts = ", ".join(dict.fromkeys(piece.part for piece in every))
             splits = ", ".join(get_args(SplitName))
-            raise ValueError(
+            raise UsageError(
                 f"only: expected parts ({parts}), categories, splits ({splits}) or these joined "
                 f"by /, found {item!r}"
             )

@@ -18,6 +18,7 @@ from bench.methods import METHODS
 from bench.tables.spec import TABLE_1_CATEGORIES, TABLE_2_CATEGORIES
 from scapo.store import StoreError
 from scapo.store.files import sha256_file
+from scapo.text import UsageError
 from tests.helpers.grids import make_splits, plan_of
 from tests.helpers.made import make_data
 
@@ -153,7 +154,7 @@ def test_chosen(tmp_path: Path):
     assert len(chosen(chains, ())) == 3
     assert [c.name for c in chosen(chains, ("scapo/seed2",))] == ["clean/oven/scapo/seed2"]
     assert len(chosen(chains, ("sca*", "icp"))) == 3
-    with pytest.raises(ValueError, match=r"only: expected parts \(clean\).*found 'scapo/laptop'"):
+    with pytest.raises(UsageError, match=r"only: expected parts \(clean\).*found 'scapo/laptop'"):
         chosen(chains, ("scapo/laptop",))
 
 

@@ -9,10 +9,10 @@ import pytest
 
 from bench.infer import model as models
 from bench.infer.model import load_model, load_models
-from bench.requests import UsageError
 from scapo.store.checkpoint import WEIGHTS
 from scapo.store.files import sha256_file
 from scapo.store.schema import StoreError
+from scapo.text import UsageError
 from tests.helpers.placed import placed_run
 
 

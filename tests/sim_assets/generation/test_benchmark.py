@@ -192,7 +192,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert "scissors/test: 2 samples of 1 objects" in text
     assert RECORD in text
     assert json.loads((tmp_path / RECORD).read_text())["total"]["samples"] == 2
-    assert run("benchmark", "sim-art/2", *flags, "--only", "chair") == 1
+    assert run("benchmark", "sim-art/2", *flags, "--only", "chair") == 2
     assert capsys.readouterr().err.startswith("scapo-data: only: expected parts")
     assert run("benchmark", "sim-art/3", *flags) == 2
 
