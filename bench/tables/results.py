@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast
@@ -173,16 +173,20 @@ class Sampled:
 
     cell: Cell
     means: Float[np.ndarray, " R"]
-    per_seed: tuple[float, ...]
+    per_seed: Mapping[int, float]
+    """The mean of each training seed that has one."""
     unit: str = "1"
 
 
 def measured(runs: Sequence[Scores], measure: Measure, seed: int) -> Sampled | None:
     """Mean over samples, slots and seeds; None where nothing was run or is defined."""
     key = (measure.metric, measure.unit)
-    tables = [run.errors[key] for run in runs if key in run.errors]
-    tables = [measure.factor * (swapped(t) if key[0] == "order" else t) for t in tables]
-    if not tables or all(np.isnan(table).all() for table in tables):
+    found = {run.run.seed: run.errors[key] for run in runs if key in run.errors}
+    tables = {
+        one: measure.factor * (swapped(table) if key[0] == "order" else table)
+        for one, table in found.items()
+    }
+    if all(np.isnan(table).all() for table in tables.values()):
         return None
     sampled = replace(_sampled(runs, tables, measure.decimals, seed), unit=measure.unit)
     return _marked(sampled, runs, measure.metric)
@@ -205,12 +209,16 @@ def seconds_per_cloud(runs: Sequence[Scores]) -> Cell:
 
 def precise(runs: Sequence[Scores], key: str, rule: ApRule, seed: int) -> Sampled | None:
     """Average precision in percent: k of n samples, over all seeds."""
-    found = [passes(run.errors, rule).get(key) for run in runs]
-    tables = [100.0 * table.reshape(len(table), -1) for table in found if table is not None]
+    found = {run.run.seed: passes(run.errors, rule).get(key) for run in runs}
+    tables = {
+        one: 100.0 * table.reshape(len(table), -1)
+        for one, table in found.items() if table is not None
+    }  # fmt: skip
     if not tables:
         return None
     sampled = _sampled(runs, tables, 2, seed)
-    passed, count = sum(int((t > 0).sum()) for t in tables), sum(t.size for t in tables)
+    passed = sum(int((table > 0).sum()) for table in tables.values())
+    count = sum(table.size for table in tables.values())
     sampled = replace(sampled, cell=_with_precision(sampled.cell, passed, count))
     return _marked(sampled, runs, "part_rotation" if key.startswith("part") else key)
 
@@ -222,22 +230,27 @@ def _with_precision(cell: Cell, passed: int, count: int) -> Cell:
     return replace(cell, value=value, count=count, passed=passed, undefined=0)
 
 
-def _sampled(runs: Sequence[Scores], tables: list[np.ndarray], decimals: int, seed: int) -> Sampled:
+def _sampled(
+    runs: Sequence[Scores], tables: Mapping[int, np.ndarray], decimals: int, seed: int
+) -> Sampled:
     instance = _same_samples(runs)
-    joined = np.concatenate(tables, 1)
+    joined = np.concatenate(list(tables.values()), 1)
     defined = joined[~np.isnan(joined)]
     means = resampled_means(joined, instance, seed=seed)
-    per_seed = tuple(float(np.nanmean(t)) for t in tables if not np.isnan(t).all())
+    per_seed = {
+        one: float(np.nanmean(table)) for one, table in tables.items()
+        if not np.isnan(table).all()
+    }  # fmt: skip
     low, high = bounds(means)
     cell = Cell(
         value=float(defined.mean()), decimals=decimals, low=low, high=high,
-        deviation=_deviation(per_seed), count=int(defined.size),
+        deviation=_deviation(per_seed.values()), count=int(defined.size),
         undefined=int(joined.size - defined.size),
     )  # fmt: skip
     return Sampled(cell, means, per_seed)
 
 
-def _deviation(per_seed: Sequence[float]) -> float | None:
+def _deviation(per_seed: Collection[float]) -> float | None:
     return spread(list(per_seed)).deviation if len(per_seed) > 1 else None
 
 
@@ -261,7 +274,7 @@ def averaged(parts: Sequence[Sampled | None]) -> Cell:
     """The mean over categories, from unrounded cells.
 
     Empty unless every category was run, and where they have two units: the states of drawers are
-    lengths, those of other joints angles.
+    lengths, those of other joints angles. Without a deviation where categories have other seeds.
     """
     known = [part for part in parts if part is not None]
     if len(known) < len(parts) or len({part.unit for part in known}) != 1:
@@ -269,11 +282,12 @@ def averaged(parts: Sequence[Sampled | None]) -> Cell:
     values = [part.cell.value for part in known if part.cell.value is not None]
     size = min(len(part.means) for part in known)
     low, high = bounds(np.mean([part.means[:size] for part in known], axis=0))
-    seeds = {len(part.per_seed) for part in known}
-    per_seed = np.mean([part.per_seed for part in known], axis=0) if len(seeds) == 1 else []
+    seeds = known[0].per_seed
+    alike = all(part.per_seed.keys() == seeds.keys() for part in known)
+    per_seed = [float(np.mean([part.per_seed[one] for part in known])) for one in seeds if alike]
     return Cell(
         value=float(np.mean(values)), decimals=known[0].cell.decimals, low=low, high=high,
-        deviation=_deviation([float(value) for value in per_seed]),
+        deviation=_deviation(per_seed),
         undefined=sum(part.cell.undefined for part in known),
         uncalibrated=any(part.cell.uncalibrated for part in known),
     )  # fmt: skip

@@ -49,9 +49,19 @@ def test_two_data_sets_are_not_mixed(tmp_path):
 
 
 def test_states_in_degrees_and_in_centimetres_have_no_mean():
-    turns = Sampled(cell=Cell(value=4.0), means=np.ones(3), per_seed=(4.0,), unit="deg")
+    turns = Sampled(cell=Cell(value=4.0), means=np.ones(3), per_seed={1: 4.0}, unit="deg")
     assert averaged([turns, turns]).value == 4
     assert averaged([turns, replace(turns, unit="m")]).value is None
+
+
+def test_a_mean_over_categories_deviates_by_its_seeds_not_by_their_places():
+    """Seeds 1 and 2 of one and 2 and 1 of the other: 2 and 5 on the mean, 2.12 apart."""
+    one, other = (
+        Sampled(cell=Cell(value=3.5), means=np.ones(3), per_seed=found)
+        for found in ({1: 1.0, 2: 6.0}, {2: 4.0, 1: 3.0})
+    )
+    assert averaged([one, other]).deviation == pytest.approx(3 / 2**0.5)
+    assert averaged([one, replace(other, per_seed={2: 4.0, 3: 3.0})]).deviation is None
 
 
 def test_a_run_is_not_counted_twice(tmp_path):
