@@ -17,6 +17,7 @@ ACROSS = torch.tensor([
     [0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0],
 ])  # fmt: skip
 """A vector times this: the matrix of the cross product with it, row by row."""
+EYE = torch.eye(3)
 
 
 def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
@@ -28,10 +29,9 @@ def rotvec_to_rotmat(vector: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     tensor(1.)
     """
     across = (vector[..., None] * ACROSS.to(vector)).sum(-2).unflatten(-1, (3, 3))
-    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
     turns = torch.linalg.vector_norm(vector, dim=-1)[..., None, None] / torch.pi
     twice = (turns / 2).sinc().square() / 2
-    return eye + turns.sinc() * across + twice * (across @ across)
+    return EYE.to(vector) + turns.sinc() * across + twice * (across @ across)
 
 
 def rotmat_to_rotvec(rotation: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3"]:

@@ -177,8 +177,10 @@ class ArticulatedTemplate(nn.Module):
 
     def own_directions(self, placement: Placement) -> Float[Tensor, "B J 3"]:
         """Unit axes of each view's own object, template frame."""
-        turn = rotvec_to_rotmat(placement.deviation)
-        return (turn @ self.directions()[:, :, None])[..., 0]
+        axis = self.directions()
+        if not bool(placement.deviation.any()):
+            return axis.expand(len(placement.state), -1, -1)
+        return (rotvec_to_rotmat(placement.deviation) @ axis[:, :, None])[..., 0]
 
     def turns(self, placement: Placement) -> Float[Tensor, "B J 3 3"]:
         """How joints turn their parts: not at all what slides, hinges about their own axes.
