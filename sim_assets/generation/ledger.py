@@ -7,17 +7,17 @@ shard with the SHA-256 of its bytes. Both go when the manifest is written.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from scapo.store import canonical_json, sha256_file, write_bytes
+from scapo.store.folders import alone
 from scapo.store.json_records import StoreError, from_json, read_json
 from scapo.store.manifest import Instance, Manifest, ManifestError, read_manifest
 from scapo.store.regular import NOT_OWN, is_odd, read_regular
@@ -75,7 +75,7 @@ class Ledger:
         self.versions = dict(versions)
         self.manifest: Manifest | None = None
         self.plan: _Plan | None = None
-        self._lock = -1
+        self._held = ExitStack()
 
     def __enter__(self) -> Ledger:
         """Create and lock the folder, and read what is there.
@@ -83,21 +83,16 @@ class Ledger:
         Raises:
             GenerateError: It holds something else, or another process is writing there.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(self.folder, os.O_RDONLY)
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise GenerateError(
-                f"{self.folder}: expected to write here alone, found another run doing so"
-            ) from error
-        except OSError as error:
-            raise GenerateError(f"{self.folder}: expected a folder to write to: {error}") from error
-        try:
+        with ExitStack() as opened:
+            try:
+                opened.enter_context(alone(self.folder, "generation"))
+            except StoreError as error:
+                raise GenerateError(str(error)) from error
+            except OSError as error:
+                message = f"{self.folder}: expected a folder to write to: {error}"
+                raise GenerateError(message) from error
             self._look()
-        except BaseException:
-            os.close(self._lock)
-            raise
+            self._held = opened.pop_all()
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
@@ -106,7 +101,7 @@ class Ledger:
         Raises:
             GenerateError: In place of an OSError, which need not say where it arose.
         """
-        os.close(self._lock)
+        self._held.close()
         if isinstance(error, OSError):
             where = error.filename or self.folder
             raise GenerateError(

@@ -96,3 +96,16 @@ def test_a_record_that_a_backup_shares_is_not_written_on(tmp_path: Path):
     with (folder / FINISHED).open("a") as file:
         file.write("more")
     assert backup.read_text() == ""
+
+
+def test_two_do_not_write_one_split_and_who_is_done_keeps_nobody_out(tmp_path: Path):
+    with (
+        Ledger(tmp_path, {"count": 1}, {"a": "1"}),
+        pytest.raises(GenerateError, match="no generation goes on, found another at work"),
+    ):
+        opened(tmp_path)
+    opened(tmp_path)
+    (tmp_path / PLAN).write_text("{")  # what is refused lets go of the folder, too
+    for _ in range(2):
+        with pytest.raises(GenerateError, match=PLAN):
+            opened(tmp_path)
