@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[3]
 SCRIPT = ROOT / "scripts/archive_scores.py"
 TABLE = (
     "method,variant,seed,sample,metric,slot,value,unit\n"
-    'icp,"a, b",1,7,iou,0,0.25,1\n'
+    'icp,"a, b",1,7,iou,0,0.291873964,1\n'
+    "icp,,1,7,joint_pivot_r4,0,1.25e-06,1\n"
     "icp,,1,8,joint_state,0,,deg\n"
 )
 
@@ -28,8 +29,8 @@ def run(*words: object) -> None:
     subprocess.run([sys.executable, SCRIPT, *map(str, words)], check=True, cwd=ROOT)
 
 
-def test_scores_are_restored_to_the_byte(tmp_path: Path):
-    """Quoted words and empty cells too; a report has the digest of the table beside it."""
+def test_scores_are_restored_with_five_digits(tmp_path: Path):
+    """Quoted words and empty cells to the byte; a report has the digest of the table beside it."""
     scores = tmp_path / "out/scores/clean/laptop.csv.gz"
     scores.parent.mkdir(parents=True)
     scores.write_bytes(gzip.compress(TABLE.encode()))
@@ -41,7 +42,7 @@ def test_scores_are_restored_to_the_byte(tmp_path: Path):
 
     run("restore", tmp_path / "back", tmp_path / "once.tar.xz")
     back = tmp_path / "back/scores/clean/laptop.csv.gz"
-    assert gzip.decompress(back.read_bytes()).decode() == TABLE
+    assert gzip.decompress(back.read_bytes()).decode() == TABLE.replace("0.291873964", "0.29187")
     said = json.loads(back.with_name("laptop.json").read_text())
     assert said == {"summary": {"n": 2}, "digests": {"scores": sha256_file(back)}}
 
