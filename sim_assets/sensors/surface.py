@@ -117,7 +117,9 @@ def incidence(shown: Surface, camera: Intrinsics) -> Float[np.ndarray, " K"]:
     b = shown.slope_v * np.float32(camera.fy)
     c = q - x * a - y * b
     size = (a * a + b * b + c * c) * (x * x + y * y + 1)
-    return np.arccos(np.minimum(q / np.sqrt(np.maximum(size, np.float32(1e-12))), 1))
+    cosine = np.minimum(q / np.sqrt(np.maximum(size, np.float32(1e-12))), 1)
+    # Single precision has other last bits with AVX-512, and a pixel in millions is then lost.
+    return np.arccos(cosine.astype(np.float64)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -28,6 +32,28 @@ def test_incidence_on_a_plane_is_the_angle_to_each_ray(degrees, turn):
     found = incidence(surface(depth), CAMERA).reshape(depth.shape)
     difference = found - angles(CAMERA, degrees, turn)
     assert np.degrees(np.abs(difference)).max() < 0.5
+
+
+ASKED = """
+import hashlib, numpy as np
+from sim_assets.sensors.surface import Surface, incidence
+from tests.helpers.depth_plates import camera
+draws = np.random.default_rng(1).random((3, 160 * 160), np.float32)
+shown = Surface(at=np.arange(160 * 160), inverse=1 + draws[0], slope_u=draws[1] / 50,
+                slope_v=draws[2] / 50, across=np.zeros(160 * 160, np.float32))
+print(hashlib.sha256(incidence(shown, camera()).tobytes()).hexdigest())
+"""
+
+
+def test_angles_are_the_same_whatever_the_processor_has():
+    """A pixel is lost where its share, which goes by the angle, is above a random number."""
+    extra = np.show_config(mode="dicts")["SIMD Extensions"]["found"]
+    said = [
+        subprocess.run([sys.executable, "-W", "ignore", "-c", ASKED], capture_output=True,
+                       text=True, check=True, env=os.environ | {"NPY_DISABLE_CPU_FEATURES": less})
+        for less in ("", " ".join(extra))
+    ]  # fmt: skip
+    assert said[0].stdout == said[1].stdout
 
 
 @pytest.mark.parametrize("degrees", [0, 60, 86])
