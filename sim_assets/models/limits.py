@@ -37,7 +37,7 @@ had the processor for most of them the asset is refused; else the machine was sl
 read again after the others, for as long as `--timeout` allows."""
 TICK = 0.5
 """Processor seconds between looks at the clock."""
-LOST = ("remove", "__del__")
+LOST = ("remove", "_remove", "__del__")
 """Functions that Python calls when an object goes, of `weakref` and destructors: what is raised in
 them is lost, with a warning."""
 
