@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """What training would take on a GPU that is not at hand, by what its steps do (row 415).
 
-    python scripts/experiments/gpu_estimate.py DATA/PART CATEGORY [METHOD/PRESET ...]
+    python scripts/experiments/gpu_estimate.py DATA/PART CATEGORY METHOD/PRESET [METHOD/PRESET ...]
 
 A line a stage: a training step is made here on a few clouds; its operators, the bytes that they
 read and write and the products that they sum are counted; each operator is given the longest of
@@ -119,10 +119,11 @@ def lines(name: str, folder: Path, category: str) -> Iterator[str]:
 
 def main() -> None:
     """Print the lines."""
+    if len(sys.argv) < 4:
+        sys.exit(__doc__)
     folder, category, *names = sys.argv[1:]
-    every = [f"{m}/{p}" for m, entry in METHODS.items() for p in entry.presets if m[-3:] != "icp"]
     torch.set_num_threads(1)
-    for name in names or every:
+    for name in names:
         for line in lines(name, Path(folder), category):
             print(line, flush=True)
 
